@@ -80,7 +80,10 @@ def load_vehicle(name: str | os.PathLike[str]) -> QuadrotorParams:
             content = read_yaml(file.read(MOST_CHARACTERS + 1))
         values = dict(content["parameters"])
     except FileNotFoundError:
-        raise
+        raise FileNotFoundError(
+            f"{shown(str(path))}: there is no such vehicle file; `sb3-maddpg identify --out` writes one, and "
+            f"{', '.join(VEHICLES)} need none."
+        ) from None
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror or error}.") from None
     except (ValueError, TypeError, KeyError) as error:

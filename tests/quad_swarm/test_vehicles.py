@@ -35,7 +35,7 @@ def test_files_that_hold_something_else_are_refused(content, tmp_path):
 
 
 def test_a_missing_file_is_named():
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.yml"):
+    with pytest.raises(FileNotFoundError, match=r"'nowhere\.yml': there is no such vehicle file; .* hummingbird"):
         load_vehicle("nowhere.yml")
 
 

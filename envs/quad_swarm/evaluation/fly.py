@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -249,7 +249,10 @@ def make_parser() -> Parser:
         help="rules and models, as for `sb3-maddpg evaluate`, and folders that `sb3-maddpg export` wrote",
     )
     parser.add_argument("--n-robots", type=int, help="number of robots (default: the preset's)")
-    parser.add_argument("--preset", help=f"{', '.join(PRESETS)} (default: that of the models, otherwise flight)")
+    parser.add_argument(
+        "--preset",
+        help=f"{', '.join(PRESETS)} (default: the world of exported folders, or that of the models, otherwise flight)",
+    )
     parser.add_argument(
         "--world", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="fields of the preset"
     )
@@ -292,8 +295,9 @@ def _main(args: argparse.Namespace) -> None:
     exported = {one for one in args.policy if (Path(one) / files.DESCRIPTION).is_file()}
     named = [one for one in args.policy if is_model(one) and one not in exported]
     models = {one: trained_in(load_model(one, args.algo)) for one in named}
-    preset = args.preset or (preset_of(models) if models else "flight")
-    config = make_config(preset, read_assignments("--world", args.world), n_robots=args.n_robots, plant=args.plant)
+    worlds = {one: files.load(one).config for one in sorted(exported)}
+    preset, base = _base(args.preset, models, worlds)
+    config = make_config(base, read_assignments("--world", args.world), n_robots=args.n_robots, plant=args.plant)
     config = for_scenario(config, args.scenario)
     if not 0 <= args.priority <= 99:
         raise ValueError(f"--priority {args.priority}: it must be from 1 to 99, or 0 for none.")
@@ -331,6 +335,26 @@ def _main(args: argparse.Namespace) -> None:
     print(LEGEND)
     if args.json is not None:
         write_rows(args.json, rows)
+
+
+def _base(
+    preset: str | None, models: Mapping[str, Any], worlds: Mapping[str, SwarmConfig]
+) -> tuple[str, str | SwarmConfig]:
+    """Return name and content of the world to begin with: a preset, that of the models, or that of exported folders.
+
+    :param preset: name of a preset, None if the user named none
+    :param models: arguments of each model's environment
+    :param worlds: world of each exported folder
+    :raises ValueError: if models or folders have different ones
+    """
+    if preset is not None or not worlds:
+        preset = preset or (preset_of(models) if models else "flight")
+        return preset, preset
+    first, *others = worlds
+    for other in others:
+        if worlds[other] != worlds[first]:
+            raise ValueError(f"{first} and {other} were exported for different worlds: fly one after the other.")
+    return "exported", worlds[first]
 
 
 def _fly(

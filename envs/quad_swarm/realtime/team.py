@@ -114,6 +114,9 @@ def _difference(exported: Any, config: Any, path: str = "") -> str:
         if dataclasses.is_dataclass(new) and type(old) is type(new):
             return _difference(old, new, f"{path}{one.name}.")
         name = f"{path}{one.name}"
-        option = f"--n-robots {new}" if name == "n_robots" else f"--world {name}={new}"
-        return f"for {name}={old}, and this one has {new}; write it for this one with `sb3-maddpg export ... {option}`"
+        given = "--n-robots {}" if name == "n_robots" else f"--world {name}={{}}"
+        return (
+            f"for {name}={old}, and this one has {new}; fly it as it was exported, with {given.format(old)}, or write "
+            f"it for this one with `sb3-maddpg export ... {given.format(new)}`"
+        )
     raise AssertionError("the worlds are equal")

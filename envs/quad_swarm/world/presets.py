@@ -500,10 +500,22 @@ class SwarmConfig:
         field = extent.field if beyond[:2].max() > self._leeway else "heights"
         wider = np.array([[-r, -r, extent.low], [r, r, extent.high]])
         wider = np.array([np.minimum(low, wider[0]), np.maximum(high, wider[1])]).round(3).tolist()
+        value = getattr(self.space, field)
+        if field == "heights":
+            fitting = [value[0] + max(low[2] - extent.low, 0.0), value[1] - max(extent.high - high[2], 0.0)]
+        else:
+            most = np.max(value) - beyond[:2].max()
+            fitting = [min(np.min(value), most), most]
+        within = [math.ceil(round(100 * fitting[0], 6)) / 100, math.floor(round(100 * fitting[1], 6)) / 100]
+        smaller = (
+            ""
+            if within[0] > within[1] or within[1] <= 0
+            else (f"space.{field}={within if isinstance(value, tuple) else within[1]}, or ")
+        )
         raise ValueError(
-            f"space.{field}={getattr(self.space, field)}: starts and goals of {scenario!r} lie up to "
-            f"{beyond.max():.3g} m outside the workspace; choose a smaller room, or planner.workspace_low={wider[0]} "
-            f"and planner.workspace_high={wider[1]}, which `make_config` also does if both are left out."
+            f"space.{field}={value}: starts and goals of {scenario!r} lie up to {beyond.max():.3g} m outside the "
+            f"workspace; give {smaller}planner.workspace_low={wider[0]} and planner.workspace_high={wider[1]}, which "
+            "`make_config` also does if both are left out."
         )
 
     @property

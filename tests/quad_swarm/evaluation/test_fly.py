@@ -146,7 +146,15 @@ def test_folders_of_exported_robots_are_flown_by_their_path(tmp_path, capsys):
     folder = tmp_path / "robots"
     export(str(pretrained_folder("quad-swarm-flight") / "model.zip"), make_config("flight", n_robots=2), folder)
     words = ["--policy", str(folder), "--link", "virtual", "--most", "1"]
-    assert main([*words, "--n-robots", "2"]) == 0
+    assert main([*words, "--json", str(tmp_path / "rows.json")]) == 0, "in the world of the folder"
     assert "robots" in capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "rows.json").read_text())
+    assert (row["n_robots"], row["preset"]) == (2, "exported")
     assert main([*words, "--n-robots", "3"]) == 1
     assert "was exported for another world: for n_robots=2, and this one has 3" in capsys.readouterr().err
+    assert main([*words, "--world", "radius=0.2"]) == 1
+    assert "fly it as it was exported, with --world radius=0.3, or write" in capsys.readouterr().err
+    other = tmp_path / "others"
+    export(str(pretrained_folder("quad-swarm-flight") / "model.zip"), make_config("flight", n_robots=3), other)
+    assert main([*words, "--policy", str(folder), str(other)]) == 1
+    assert "were exported for different worlds" in capsys.readouterr().err

@@ -255,6 +255,11 @@ def test_a_room_beyond_a_given_workspace_is_refused_where_it_is_used(name, chang
     wider = re.findall(r"workspace_\w+=(\[[^]]*\])", str(caught.value))
     workspace = dict(zip(given, map(ast.literal_eval, wider), strict=True))
     ScenarioSampler(name, 4, config.space, make_config("paper", planner=workspace, space=changes))
+    ((field, smaller),) = re.findall(r"give space\.(\w+)=(.*?), or", str(caught.value)) or [("", "")]
+    assert (not field) is ("heights" in changes), "no smaller heights are left"
+    if field:
+        config = make_config("paper", planner=given, space={field: ast.literal_eval(smaller)})
+        ScenarioSampler(name, 4, config.space, config)
     other = "random" if name != "random" else "symmetric_swap"
     if "heights" not in changes:
         ScenarioSampler(other, 4, config.space, config)
