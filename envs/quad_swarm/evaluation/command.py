@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import importlib
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -122,8 +123,9 @@ def format_table(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> str:
 def _wrapped(texts: list[str], most: int) -> list[list[str]]:
     """Return a line of the table, and additional lines for the rest of the policy's name."""
     scenario, name, *cells = texts
-    lines = [[scenario, name[:most], *cells]]
-    return lines + [["", name[k : k + most], *("" for _ in cells)] for k in range(most, len(name), most)]
+    # Behind operators of rules and in front of thresholds, if there is such a place
+    first, *rest = re.findall(rf".{{1,{most}}}(?:(?<=[&|/])|(?=@)|$)|.{{1,{most}}}", name)
+    return [[scenario, first, *cells], *(["", part, *("" for _ in cells)] for part in rest)]
 
 
 def _latex(texts: Sequence[Sequence[str]]) -> str:
