@@ -26,7 +26,7 @@ import numpy as np
 
 from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import first_episode
-from quad_swarm.evaluation.fly import episodes
+from quad_swarm.evaluation.real_time import episodes
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.planner import make_planner
 from quad_swarm.realtime.loop import freeze_garbage

@@ -11,13 +11,15 @@ version = release = version_of("sb3-maddpg")
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
     "sphinx-mathjax-offline",
     "sphinxarg.ext",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_design",
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "_templates"]
+templates_path = ["_templates"]
 html_theme = "furo"
 html_title = "sb3-maddpg"
 html_logo = "images/logo.svg"
@@ -33,6 +35,7 @@ smartquotes_action = "qe"  # no dashes: options begin with two hyphens
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 4
 
+autosummary_ignore_module_all = False
 autodoc_member_order = "bysource"
 maximum_signature_line_length = 88
 autodoc_typehints = "description"

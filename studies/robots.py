@@ -34,8 +34,8 @@ import numpy as np
 
 from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import first_episode
-from quad_swarm.evaluation.fly import episodes
 from quad_swarm.evaluation.inference import wilson_interval
+from quad_swarm.evaluation.real_time import episodes
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.realtime import Conditions
 from quad_swarm.realtime.team import Team

@@ -110,6 +110,7 @@ def checked(cls: type[T]) -> type[T]:
     Nested dataclasses may be mappings. Truth values are no numbers. Invalid values raise a `ValueError` with one line.
     """
     plain = [field.name for field in dataclasses.fields(cls) if "bool" not in str(field.type)]  # type: ignore[arg-type]
+    documentation = cls.__doc__
 
     def unflagged(values: Any) -> Any:
         if isinstance(values, ArgsKwargs):
@@ -136,6 +137,7 @@ def checked(cls: type[T]) -> type[T]:
             raise explained(error, cls) from None
 
     strict.__init__ = init  # type: ignore[method-assign]
+    strict.__doc__ = documentation  # which pydantic leaves out
     return strict  # type: ignore[return-value]
 
 

@@ -4,6 +4,8 @@ Imports are read from the source, those inside functions included.
 """
 
 import ast
+import importlib
+import inspect
 import re
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -53,7 +55,7 @@ ROOMS = {
 # Foundations that stand on compiled code
 ON_NATIVE = {"quad_swarm.quadrotor"}
 # Drawing is optional, so whoever draws imports figures inside a function, where it is asked for.
-DRAW_ON_REQUEST = {"quad_swarm.interfaces.env", "quad_swarm.evaluation.command", "quad_swarm.evaluation.fly"}
+DRAW_ON_REQUEST = {"quad_swarm.interfaces.env", "quad_swarm.evaluation.command", "quad_swarm.evaluation.real_time"}
 
 NEED_NO_TEST = {"sb3_maddpg.__main__", "sb3_maddpg.callbacks", "quad_swarm.figures.colours"}
 # Modules that are tested through what is built on them
@@ -186,6 +188,16 @@ def test_every_module_has_its_test_file():
     named = {TESTED_WITH.get(name, name) for name, path in ALL.items() if path.name != "__init__.py"} - NEED_NO_TEST
     without = sorted(test_of(name) for name in named if not (ROOT / test_of(name)).exists())
     assert not without, "every module has a test file of its name: write " + ", ".join(without)
+
+
+def test_importing_a_module_does_not_replace_what_its_package_exports():
+    """``from quad_swarm.evaluation import fly`` was a module after that had been imported."""
+    for name in [name for name, path in ALL.items() if path.name == "__init__.py"]:
+        package = importlib.import_module(name)
+        for one in set(getattr(package, "__all__", ())) - {"errors"}:
+            if f"{name}.{one}" in ALL:
+                importlib.import_module(f"{name}.{one}")
+                assert not inspect.ismodule(getattr(package, one)), f"{name} exports {one}"
 
 
 def test_the_guide_names_every_room():

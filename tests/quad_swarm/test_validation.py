@@ -13,7 +13,7 @@ from pydantic import PositiveInt
 from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.task.request_task import make_task
 from quad_swarm.validation import Range, checked, checked_arguments, read_yaml, replaced, with_fields
-from quad_swarm.world.presets import make_config
+from quad_swarm.world.presets import SwarmConfig, make_config
 
 
 @checked
@@ -61,6 +61,11 @@ def function(number: PositiveInt, text: str | Mapping[str, float] = "", **others
 def test_one_line_says_where_and_what(call, message):
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         call()
+
+
+@pytest.mark.parametrize("cls", [QuadrotorParams, SwarmConfig])
+def test_a_checked_class_keeps_its_documentation(cls):
+    assert ":param" in cls.__doc__
 
 
 def test_values_come_in_their_types():

@@ -9,7 +9,7 @@ from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import parse_qs, urlsplit
 
-from quad_swarm.evaluation.fly import recorded
+from quad_swarm.evaluation.real_time import recorded
 from quad_swarm.figures.replay import live_page, live_step
 from quad_swarm.realtime.process import Sample
 from quad_swarm.world.presets import SwarmConfig

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from quad_swarm.evaluation.command import main
-from quad_swarm.evaluation.fly import main as fly_main
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.judging import judge, totals
+from quad_swarm.evaluation.real_time import main as fly_main
 from quad_swarm.evaluation.recordings import SUFFIXES, read, read_flights, write
 from quad_swarm.world.presets import make_config
 

@@ -135,7 +135,7 @@ def test_reports_are_told_as_words(nodes):
 
 FLIES = """
 import numpy as np
-from quad_swarm.evaluation.fly import main
+from quad_swarm.evaluation.real_time import main
 words = ["--policy", "full", "--n-robots", "4", "--link", "ros2", "--loss", "0.1", "--json", "rows.json"]
 raise SystemExit(main(words))
 """

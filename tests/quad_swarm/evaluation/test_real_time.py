@@ -9,7 +9,7 @@ import pytest
 from network import alone
 
 from quad_swarm.evaluation.flight import Condition, begin, first_episode
-from quad_swarm.evaluation.fly import episodes, main
+from quad_swarm.evaluation.real_time import episodes, main
 from quad_swarm.evaluation.recordings import read
 from quad_swarm.world.presets import make_config
 
