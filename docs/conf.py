@@ -9,7 +9,7 @@ project_copyright = f"2026 {author}"
 version = release = version_of("sb3-maddpg")
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx-mathjax-offline",
@@ -34,6 +34,7 @@ html_js_files = ["keyboard.js"]
 smartquotes_action = "qe"  # no dashes: options begin with two hyphens
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 4
+nb_execution_mode = "off"  # `python -m studies.notebooks` keeps the outputs in the notebooks
 
 autosummary_ignore_module_all = False
 autodoc_member_order = "bysource"
