@@ -5,7 +5,7 @@ nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios 
 ``rules``, ``teams`` (four and twelve) and ``none``; set 701 ``learned`` (version 1's model), ``hummingbird`` and
 ``crazyflie`` (the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and
 ``crowd`` (full communication of sixteen) in all scenarios; set 702 ``identified``, RotorPy's Hummingbird with its own
-model in the planner. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written
+model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five times as often. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written
 after each part, so that a run that is ended keeps what it has.
 """
 
@@ -30,7 +30,7 @@ from studies.swarm.experiment import condition
 from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import world
 
-SEALED, LATER, LAST = 700, 701, 702
+SEALED, LATER, LAST, MORE = 700, 701, 702, 703
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -82,6 +82,7 @@ PARTS = {
     "four": Part(("full",), EVERYWHERE, (4,), 2000, LATER),
     "twelve": Part(("full",), EVERYWHERE, (12,), 2000, LATER),
     "crowd": Part(("full",), EVERYWHERE, (16,), 2000, LATER),
+    "eight": Part(("full",), EVERYWHERE, (8,), 10000, MORE),
 }
 
 
