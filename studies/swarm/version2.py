@@ -5,8 +5,9 @@ nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios 
 ``rules``, ``teams`` (four and twelve) and ``none``; set 701 ``learned`` (version 1's model), ``hummingbird`` and
 ``crazyflie`` (the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and
 ``crowd`` (full communication of sixteen) in all scenarios; set 702 ``identified``, RotorPy's Hummingbird with its own
-model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five times as often. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written
-after each part, so that a run that is ended keeps what it has.
+model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five
+times as often. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written after each
+part, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
