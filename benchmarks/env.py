@@ -6,6 +6,10 @@ an image of 640 x 480 in each step. The world `flight` is also stepped without i
 of way. Each cell runs one process per core, pinned to it if possible; rates of two cores
 are sums. The shares are measured afterwards, since timers take time themselves. JSON: one row per cell with the keys
 face, world, n_robots, n_envs, cores, steps_per_s, and the share of each part.
+
+``python benchmarks/env.py --pair flight flight-v2 [--rounds 20] [--json F]`` steps 64 swarms of two worlds in turns, on
+one core, and prints how many times as long the second takes for a step (processor time), and for planning in it: median
+and quartiles of the rounds. JSON: one row with the keys worlds, rounds, ``step`` and ``solve``, each the quartiles.
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ import argparse
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +47,7 @@ WORLDS: dict[str, dict[str, Any]] = {
     "flight": {"preset": "flight"},
     "flight, no disturbances": {"preset": "flight", "world": EXACT},
     "flight, no right of way": {"preset": "flight", "planner": {"right_of_way": 0.0}},
+    "flight-v2": {"preset": "flight-v2"},
 }
 CELLS = [
     *((face, world, 1) for face in ("gym", "render") for world in ("paper", "dense")),
@@ -96,6 +101,38 @@ def measure(face: str, world: str, n_envs: int, core: int, seconds: float, solve
     return {"steps_per_s": flown * n_envs / elapsed, **shares, "rest": 1 - sum(shares.values())}
 
 
+def compare(worlds: Sequence[str], rounds: int, solver: str) -> dict[str, Any]:
+    """Step two worlds in turns. Return the quartiles of the ratios of their processor times, the second's to the
+    first's."""
+    steppers = [_Stepper(WORLDS[world], solver) for world in worlds]
+    times = np.array([[stepper.round() for stepper in steppers] for _ in range(rounds)])  # (rounds, worlds, parts)
+    quartiles = np.quantile(times[:, 1] / times[:, 0], (0.25, 0.5, 0.75), axis=0).T
+    return {"worlds": list(worlds), "rounds": rounds, "step": quartiles[0].tolist(), "solve": quartiles[1].tolist()}
+
+
+class _Stepper:
+    """Steps 64 swarms, and measures processor times of the step and of planning in it."""
+
+    def __init__(self, kwargs: dict[str, Any], solver: str):
+        made = gymnasium.make_vec("QuadSwarm-v0", num_envs=64, **kwargs, scenario="mixed", solver=solver)
+        self._env, self._count = GymnasiumVecEnv(made), 0
+        self._env.seed(0)
+        self._env.reset()
+        self._actions = np.random.default_rng(0).integers(0, 2, (64, *self._env.action_space.shape, 64), dtype=np.int8)
+        planner = made.unwrapped.task.swarm.planner  # type: ignore[attr-defined]
+        self._planned = [0.0]
+        planner.plan = timed(planner.plan, self._planned)
+        self.round()
+
+    def round(self) -> tuple[float, float]:
+        """Return the processor time of a hundred steps, and how much of it went into planning (s)."""
+        self._planned[0], started = 0.0, time.process_time()
+        for _ in range(100):
+            self._env.step(self._actions[self._count % 64].T)
+            self._count += 1
+        return time.process_time() - started, self._planned[0]
+
+
 def attach_timers(task: RequestTask) -> dict[str, list[float]]:
     """Measure the time of each part of a step."""
     timers: dict[str, list[float]] = {}
@@ -117,7 +154,19 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the cells as a JSON list")
     parser.add_argument("--seconds", type=float, default=4.0, help="seconds per cell (default 4)")
     parser.add_argument("--solver", default="auto", help="planner's solver (default auto)")
+    parser.add_argument("--pair", nargs=2, choices=WORLDS, help="compare two worlds instead")
+    parser.add_argument("--rounds", type=int, default=20, help="rounds of a hundred steps of a pair (default 20)")
     args = parser.parse_args()
+    if args.pair:
+        row = compare(args.pair, args.rounds, args.solver)
+        for part in ("step", "solve"):
+            low, median, high = row[part]
+            print(
+                f"{part}: {args.pair[1]} takes {median:.2f} times as long as {args.pair[0]} ({low:.2f} to {high:.2f})"
+            )
+        if args.json:
+            write_rows(args.json, [row])
+        return
     rows = []
     print(f"{'face':7} {'world':23} {'envs':>5} {'cores':>5} {'steps/s':>9}   shares of the time")
     for face, world, n_envs in CELLS:
