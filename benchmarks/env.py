@@ -118,8 +118,9 @@ class _Stepper:
         self._env, self._count = GymnasiumVecEnv(made), 0
         self._env.seed(0)
         self._env.reset()
-        self._actions = np.random.default_rng(0).integers(0, 2, (64, *self._env.action_space.shape, 64), dtype=np.int8)
-        planner = made.unwrapped.task.swarm.planner  # type: ignore[attr-defined]
+        swarm = made.unwrapped.task.swarm  # type: ignore[attr-defined]
+        n, planner = swarm.config.n_robots, swarm.planner
+        self._actions = np.random.default_rng(0).integers(0, 2, (64, 64, n * (n - 1)), dtype=np.int8)
         self._planned = [0.0]
         planner.plan = timed(planner.plan, self._planned)
         self.round()
@@ -128,7 +129,7 @@ class _Stepper:
         """Return the processor time of a hundred steps, and how much of it went into planning (s)."""
         self._planned[0], started = 0.0, time.process_time()
         for _ in range(100):
-            self._env.step(self._actions[self._count % 64].T)
+            self._env.step(self._actions[self._count % 64])
             self._count += 1
         return time.process_time() - started, self._planned[0]
 
