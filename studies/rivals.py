@@ -3,7 +3,8 @@
 ``python -m studies.rivals [--json F]`` flies 100 episodes of eight robots in each of two presets and three scenarios.
 ``python -m studies.rivals --choose orca voronoi [--json F]`` flies the grids from which the parameters of both were
 chosen, on another set of episodes: most episodes in which all arrive without a collision before the preset's time
-limit, and of those that are equal the shortest time to arrival.
+limit, and of those that are equal the shortest time to arrival. ``--crowds`` flies ORCA with the parameters that were
+chosen in free rooms and with those of crowds, where they were chosen, on a set of their own.
 
 Whoever has not arrived after `LIMIT` seconds without a collision is deadlocked. JSON: one row per preset, scenario and
 swarm with what `quad_swarm.evaluation.summarise` returns, ``in_time`` (arrived before the preset's time limit) and
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,7 +31,7 @@ from quad_swarm.planner import PROBLEMS, SOLVERS, OrcaSolver, VoronoiCells
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
 from studies.swarm import protocol
 
-CHOOSING, MEASURED = 93, 94  # sets of held-out episodes
+CHOOSING, MEASURED, OF_CROWDS = 93, 94, 97  # sets of held-out episodes
 N_ROBOTS = 8
 SCENARIOS = ("symmetric_swap", "asymmetric_swap", "random")
 WORLDS = ("paper", "flight")
@@ -62,6 +64,8 @@ FIRST: dict[str, dict[str, Any]] = {
     "crowds": {"speed": 4.0, "settling": 0.4},
 }
 CROWDS = (("symmetric_swap", 16), ("forest", 8), ("doorway", 8))
+# ORCA's parameters: its own, and those that `--choose crowds` chose
+POINTS: dict[str, dict[str, Any]] = {"of free rooms": {}, "of crowds": {"margin": 0.05}}
 
 
 def fly(
@@ -163,6 +167,19 @@ def measure(swarms: list[str], episodes: int) -> Iterator[dict[str, Any]]:
             }
 
 
+def measure_crowds(episodes: int) -> Iterator[dict[str, Any]]:
+    """Fly ORCA with each of `POINTS`. Yields a row for each point and world."""
+    for name, values in POINTS.items():
+        try:
+            SOLVERS["orca"] = functools.partial(OrcaSolver, **values)
+            flown = fly("none", "orca", None, episodes, OF_CROWDS, None, crowds())
+        finally:
+            SOLVERS["orca"] = OrcaSolver
+        for condition, rows in flown.items():
+            keys = {"swarm": f"ORCA, parameters {name}", "scenario": condition.scenario}
+            yield keys | {"n_robots": condition.config.n_robots} | summarise(rows, condition.config)
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Format the rows of `measure`."""
     texts = [["preset", "scenario", "swarm", "collided", "95 % interval", "in time", "deadlocked", "arrival (s)"]]
@@ -184,6 +201,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--choose", nargs="+", choices=GRIDS, default=[], help="fly the grids of these instead")
+    parser.add_argument("--crowds", action="store_true", help="fly ORCA in crowds and among obstacles instead")
     parser.add_argument("--swarm", nargs="+", choices=SWARMS, default=list(SWARMS), help="fly these only")
     parser.add_argument("--episodes", type=int, help="per preset and scenario (default 100, of the grids 24)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows")
@@ -197,7 +215,17 @@ def main() -> None:
                 flush=True,
             )
             rows.append(row)
-    if not args.choose:
+    if args.crowds:
+        for row in measure_crowds(args.episodes or 300):
+            low, high = 100 * row["collision_low"], 100 * row["collision_high"]
+            print(
+                f"{row['swarm']}, {row['n_robots']}, {row['scenario']}: {row['collisions']} of {row['episodes']} "
+                f"collided [{low:.1f}, {high:.1f}] %, {row['arrived']} arrived, "
+                f"{row['steps_to_arrival'] or math.nan:.1f} steps",
+                flush=True,
+            )
+            rows.append(row)
+    elif not args.choose:
         rows = list(measure(args.swarm, args.episodes or 100))
         print(table(rows))
     if args.json is not None:

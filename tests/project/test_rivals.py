@@ -33,3 +33,19 @@ def test_points_of_a_grid_fly_with_their_parameters_alone(monkeypatch):
     assert slow["seconds"] > fast["seconds"]
     assert (fast["episodes"], fast["in_time"], fast["collisions"]) == (2, 2, 0)
     assert (SOLVERS["orca"], PROBLEMS["voronoi"]) == (OrcaSolver, VoronoiCells)
+
+
+def test_crowds_are_flown_with_both_points(monkeypatch):
+    monkeypatch.setattr(rivals, "CROWDS", (("symmetric_swap", 3),))
+    rows = list(rivals.measure_crowds(2))
+    assert [row["swarm"] for row in rows] == ["ORCA, parameters of free rooms", "ORCA, parameters of crowds"]
+    assert {row["arrived"] for row in rows} == {2}
+    assert rows[0]["steps_to_arrival"] != rows[1]["steps_to_arrival"], "the parameters differ"
+    assert SOLVERS["orca"] is OrcaSolver
+
+
+def test_the_point_of_crowds_won_where_it_was_chosen():
+    best = max(recorded("rivals_choice_crowds.json"), key=rivals.merit)["parameters"]
+    solver = OrcaSolver(make_problem(PlannerConfig(), QuadrotorParams(), 1))
+    own = {name: getattr(solver, name) for name in best}
+    assert {name: value for name, value in best.items() if value != own[name]} == rivals.POINTS["of crowds"]
