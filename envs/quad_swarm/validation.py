@@ -359,6 +359,8 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         *parents, name = map(str, place)
         where = ".".join((*path, *parents))
         kind = f"{where or owner.__name__} parameter" if isinstance(owner, type) else "argument"
+        if isinstance(owner, type) and not parents and (deeper := _deeper(owner, name)):
+            return ValueError(f"Unknown {kind} {shown(name)}: did you mean {' or '.join(deeper)}?")
         return unknown_name(kind, name, _names(owner, parents))
     if "str" in place:  # in a union, each member reports an error under the name of its type
         place = place[: place.index("str")]
@@ -391,6 +393,12 @@ def _names(owner: Any, path: Sequence[str] = ()) -> list[str]:
         if not name.isdigit():  # an entry of a list
             owner = _dataclass_in(get_type_hints(owner)[name])
     return [field.name for field in dataclasses.fields(owner)]
+
+
+def _deeper(owner: Any, name: str) -> list[str]:
+    """Return where a name is a field of the dataclasses that the fields of one hold."""
+    held = {field: _dataclass_in(annotation) for field, annotation in get_type_hints(owner).items()}
+    return [f"{field}.{name}" for field, one in held.items() if one is not None and name in _names(one)]
 
 
 def _dataclass_in(annotation: Any) -> Any:

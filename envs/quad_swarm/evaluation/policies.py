@@ -180,7 +180,7 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
         The policy raises it if ``predict`` raises or answers with something else than bits
     """
     if callable(model) and not isinstance(model, type) and not callable(getattr(model, "predict", None)):
-        return _by_rule(_guarded(name, model)), PaperObservation(config)
+        return _by_rule(checked_rule(name, model)), PaperObservation(config)
     predictor, observation, n_bits = fitted(model, name, config)
     n, m = config.n_robots, config.n_others
     options = {"deterministic": True} if _accepts(predictor.predict, "deterministic") else {}
@@ -204,18 +204,6 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
         return bits.reshape(-1, n, m, n_bits)
 
     return request, observation
-
-
-def _guarded(name: str, rule: Rule) -> Rule:
-    """Return a rule from outside, which fails in one sentence."""
-
-    def guarded(view: View) -> np.ndarray:
-        try:
-            return rule(view)
-        except Exception as error:  # whatever a foreign function raises
-            raise ValueError(f"{name}: the rule failed ({type(error).__name__}: {error}).") from error
-
-    return checked_rule(name, guarded)
 
 
 def fitted(model: Any, name: str, config: SwarmConfig) -> tuple[Any, Observation, int]:

@@ -28,6 +28,7 @@ from quad_swarm.evaluation.policies import is_model, load_model, short_names, tr
 from quad_swarm.evaluation.recordings import MEASURED, Recording, check_suffix, numbered, write
 from quad_swarm.evaluation.rows import aligned, check_writable, write_rows
 from quad_swarm.parsing import Parser
+from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.arena import Arena, Exchange
 from quad_swarm.realtime.link import Conditions
 from quad_swarm.realtime.process import Sample, set_priority
@@ -47,6 +48,7 @@ from quad_swarm.world.scenarios import CHANGING_GOALS, SCENARIOS, ScenarioSample
 EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swarm-flight --episodes 3 --loss 0.1"
 LINKS = ("udp", "ros2", "virtual")
 _LINGER = 1.0  # s
+_MUCH = 0.02  # share of late commands
 _ATTEMPTS = 3  # to fly an episode without the machine standing still
 
 
@@ -130,7 +132,8 @@ COLUMNS = [
     Column("again", lambda row: str(row["repeated"])),
 ]
 LEGEND = (
-    "plans: sent, of all that could be; B/s: sent by a robot in a second; age: of plans when used, median / 99.9 %;\n"
+    "in: until the last robot was at its goal for the first time; plans: sent, of all that could be, in the whole\n"
+    "flight; B/s: sent by a robot in a second; age: of plans when used, median / 99.9 %;\n"
     "missed, late: periods skipped, commands later than assumed; CPU: of a core, by a robot's process\n"
     "again: flights that did not count, since the machine stood still meanwhile"
 )
@@ -321,12 +324,15 @@ def _main(args: argparse.Namespace) -> None:
             page = stack.enter_context(LivePage(config, args.live))
             print(f"The flights are shown at {page.url}", file=sys.stderr, flush=True)
             watchers.append(page)
-        for policy in args.policy:
+        teams = {}
+        for policy in args.policy:  # all of them before the first flight
             flown_as = policy
             if policy in models:
                 flown_as = stack.enter_context(tempfile.TemporaryDirectory(prefix="quad-swarm-"))
                 export(policy, config, Path(flown_as), args.algo)
-            team = Team(config, flown_as, conditions=Conditions(args.loss), **options)
+            teams[policy] = Team(config, flown_as, conditions=Conditions(args.loss), **options)
+            _try(teams[policy], scenes[0][0])
+        for policy, team in teams.items():
             flown = _fly(team, scenes, args, names[policy], recorder, watchers)
             rows.append({"policy": names[policy], **about, **flown.row()})
             if args.link == "virtual":  # one process flies all robots
@@ -335,6 +341,17 @@ def _main(args: argparse.Namespace) -> None:
     print(LEGEND)
     if args.json is not None:
         write_rows(args.json, rows)
+
+
+def _try(team: Team, scene: Scene) -> None:
+    """Let a robot decide once. In flight, errors of a policy are counted, and the robot asks everybody.
+
+    :raises ValueError: if its policy fails
+    """
+    robot, still = team.robot(0), np.zeros(9)
+    still[POSITION] = scene.starts[0]
+    robot.reset(scene.starts[0], scene.goals[0], team.late, obstacles=scene.obstacles)
+    robot.decide(0, still, scene.starts[1:], np.zeros_like(scene.starts[1:]))
 
 
 def _base(
@@ -370,11 +387,26 @@ def _fly(
     for flight, counts in fly(team, scenes, args.link, args.most, watchers, policy):
         if counts:
             flown.flights.append(flight)
-            print(_line(policy, len(flown.flights), flight), file=sys.stderr, flush=True)
-            if recorder is not None:
-                recorder.write(flight)
+            kept = "" if recorder is None else f" -> {recorder.write(flight)}"
+            print(f"{_line(policy, len(flown.flights), flight)}{kept}", file=sys.stderr, flush=True)
         flown.repeated += not counts
+    _warn(policy, flown)
     return flown
+
+
+def _warn(policy: str, flown: Flown) -> None:
+    """Say what makes flights doubtful: errors, and commands that were later than planned."""
+    done = total(flight.total for flight in flown.flights)
+    errors = {name: count for name, count in done.counts.items() if name.startswith("errors")}
+    if errors:
+        counted = ", ".join(f"{count} {name}" for name, count in sorted(errors.items()))
+        print(f"{policy}: {counted}; the last one: {done.last_error}", file=sys.stderr)
+    if (late := done.share("late commands") or 0.0) > _MUCH:
+        print(
+            f"{policy}: {late:.0%} of the commands were later than planned, so these flights say little: fly on a "
+            "machine with less to do or fewer robots, with --priority, a larger --late, or --link virtual.",
+            file=sys.stderr,
+        )
 
 
 class _Recorder:
@@ -399,16 +431,19 @@ class _Recorder:
     def end(self) -> None:
         """See `Watcher`."""
 
-    def write(self, flight: Flight) -> None:
+    def write(self, flight: Flight) -> Path:
         """Write the recording of the last flight.
 
         :param flight: how it ended
+        :return: the file
         """
         self._written += 1
         recording = recorded(self._samples, self._config, self._scene, self._policy)
         row = Flown(self._config.n_robots, [flight]).row()
         recording = dataclasses.replace(recording, measured={name: row[name] for name in MEASURED})
-        write(numbered(self._path, self._written, self._count), recording)
+        path = numbered(self._path, self._written, self._count)
+        write(path, recording)
+        return path
 
 
 def recorded(samples: Sequence[Sample], config: SwarmConfig, scene: Scene, policy: str) -> Recording:

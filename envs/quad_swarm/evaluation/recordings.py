@@ -26,7 +26,9 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import warnings
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +42,7 @@ from quad_swarm.geometry import closest_approach, flattened, length
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.validation import replaced
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.doubts import DoubtfulWorld
 from quad_swarm.world.obstacles import Obstacle, Surroundings, between, surroundings
 from quad_swarm.world.presets import SwarmConfig, make_config
 
@@ -49,7 +52,7 @@ _SET = ("roll_set", "pitch_set", "climb_set", "yaw_rate_set")
 _GOAL = ("goal_x", "goal_y", "goal_z")
 _MOST_ROBOTS, _MOST_TIMES, _MOST_OBSTACLES = 1000, 10**6, 200
 _MOST_DISTANCES = 10**6  # at once
-_FASTEST, _SLOWEST, _SHORT = 100.0, 0.01, 0.5  # m/s, m/s, m
+_FASTEST, _SLOWEST, _SHORT = 20.0, 0.01, 0.5  # m/s, m/s, m
 # What a file need not tell: velocities are then differences, attitudes 0, goals where robots end, nobody talks, and
 # radii are those of a preset
 GUESSES = ("velocity", "attitude", "goal", "talk", "radius")
@@ -353,14 +356,18 @@ def read(path: Path) -> Recording:
     except OSError as error:
         raise ValueError(f"{path} cannot be read ({error.strerror}).") from None
     except (ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile, EOFError, RecursionError) as error:
-        raise ValueError(f"{path} is no recording of a flight: {shown(str(error))}.") from None
+        told = " ".join(str(error).split()) if isinstance(error, ValueError) else shown(str(error))
+        raise ValueError(f"{path} is no recording of a flight: {told[:300].rstrip('.')}.") from None
 
 
 def _check_units(recording: Recording) -> None:
-    """Check that robots move as fast as robots do.
+    """Check that robots move as fast, and lean as much, as robots do.
 
     :raises ValueError: if they do not
     """
+    steepest = float(np.abs(recording.state[..., 6:8]).max())
+    if steepest > np.pi:
+        raise ValueError(f"its roll and pitch are up to {steepest:.3g}: give attitudes in rad")
     moved = length(np.diff(recording.state[..., POSITION], axis=0))
     speed, paths = moved / np.diff(recording.time)[:, None], moved.sum(axis=0)
     typical = float(np.median(speed[moved > 0])) if moved.any() else 0.0
@@ -392,7 +399,9 @@ def read_flights(
         if recording.n_robots < 2:
             raise ValueError(f"{path} holds one robot, which cannot meet another: name a flight of two or more.")
         base = preset or (recording.config() if recording.world else "flight")
-        world = make_config(base, changes, n_robots=recording.n_robots)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DoubtfulWorld)  # which is about what will fly
+            world = make_config(base, changes, n_robots=recording.n_robots)
         listed = world.obstacles.listed
         given = recording.world and listed != recording.config().obstacles.listed
         obstacles = listed if listed and given else recording.obstacles or listed
@@ -492,22 +501,40 @@ def _write_csv(path: Path, recording: Recording) -> None:
 def _rows_of_csv(path: Path) -> tuple[list[dict[str, Any]], np.ndarray, int]:
     """Return the rows of a table by time and robot, the times (T,), and the number of robots n."""
     with path.open(encoding="utf-8-sig", newline="") as file:
-        rows: list[dict[str, Any]] = list(csv.DictReader(file))
-    needed = ("time", "robot", *_STATE[:3])
-    if not rows or not set(needed) <= rows[0].keys():
-        missing = [name for name in needed if not rows or name not in rows[0]]
+        table = csv.DictReader(file)
+        rows: list[dict[str, Any]] = list(table)
+    titles = table.fieldnames or ()
+    missing = [name for name in ("time", "robot", *_STATE[:3]) if name not in titles]
+    if missing and any(";" in title or "\t" in title for title in titles):
+        raise ValueError("its columns are separated by semicolons or tabs: separate them by commas")
+    if missing:
         raise ValueError(f"it needs the columns time, robot, x, y and z, and has no {', '.join(missing)}")
-    times = sorted({float(row["time"]) for row in rows})
     for line, row in enumerate(rows, start=2):
-        number = float(row["robot"])
-        if not number.is_integer():
-            raise ValueError(f"line {line}: robot={row['robot']} is no whole number")
-        row["robot"] = int(number)
-    robots = sorted({row["robot"] for row in rows})
-    if robots != list(range(len(robots))) or len(rows) != len(times) * len(robots):
-        raise ValueError("it needs one row for each time and each robot, whose numbers count from 0")
-    rows.sort(key=lambda row: (float(row["time"]), row["robot"]))
+        row["time"], row["robot"] = _number(row, "time", line), _number(row, "robot", line)
+        if not row["robot"].is_integer():
+            raise ValueError(f"line {line}: robot={row['robot']:g} is no whole number")
+        row["robot"] = int(row["robot"])
+    times, robots = sorted({row["time"] for row in rows}), sorted({row["robot"] for row in rows})
+    if robots != list(range(len(robots))):
+        named = ", ".join(map(str, robots[:8]))
+        raise ValueError(f"its robots have the numbers {named}: count them from 0, without gaps")
+    found = Counter((row["time"], row["robot"]) for row in rows)
+    for time in times if len(rows) != len(times) * len(robots) or len(found) != len(rows) else ():
+        for robot in robots:
+            if (count := found[time, robot]) != 1:
+                raise ValueError(
+                    f"it has {count or 'no'} rows of robot {robot} at time {time:g}, and needs one row for each time "
+                    "and each robot: interpolate"
+                )
+    rows.sort(key=lambda row: (row["time"], row["robot"]))
     return rows, np.array(times), len(robots)
+
+
+def _number(row: Mapping[str, Any], name: str, line: int) -> float:
+    try:
+        return float(row[name])
+    except (TypeError, ValueError):
+        raise ValueError(f"line {line}: {name}={shown(row[name])} is no number") from None
 
 
 def _has(row: Mapping[str, Any], names: Sequence[str]) -> bool:

@@ -68,7 +68,15 @@ class Team:
             if dataclasses.replace(exported, **known) != self.config:
                 raise ValueError(f"{self.policy} was exported for another world: {_difference(exported, self.config)}")
         else:
-            RulePolicy(self.policy)
+            try:
+                RulePolicy(self.policy)
+            except ValueError as error:
+                if os.path.exists(self.policy):
+                    raise ValueError(
+                        f"{shown(self.policy)} is no folder that `sb3-maddpg export` wrote, which holds "
+                        f"{files.DESCRIPTION}, and no rule ({error})"
+                    ) from None
+                raise ValueError(f"{error} There is no folder of that name either.") from None
 
     @property
     def is_learned(self) -> bool:

@@ -76,7 +76,10 @@ def _program(path: str) -> Any:
     try:
         import onnxruntime
     except ImportError:
-        raise ValueError(f"{path}: learned policies need ONNX Runtime: pip install onnxruntime.") from None
+        raise ValueError(
+            f"{path}: learned policies need ONNX Runtime: in the clone, pip install -e '.[onnx]', or on a robot, "
+            "pip install onnxruntime."
+        ) from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:

@@ -50,7 +50,8 @@ def make_context(args: Sequence[str] | None = None) -> Any:
         import rclpy
     except ImportError:
         raise ImportError(
-            "ROS 2 is not there: source a distribution's setup.bash, or pip install 'sb3-maddpg[ros]' on x86-64."
+            "ROS 2 is not there: source a distribution's setup.bash, or on x86-64, in the clone, "
+            "pip install -e '.[ros]'."
         ) from None
     context = rclpy.Context()
     try:

@@ -9,6 +9,8 @@ separation, within 1.5 seconds.
 from __future__ import annotations
 
 import functools
+import os
+import traceback
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -218,16 +220,23 @@ def _parse_one(text: str, instead: Mapping[str, Callable[..., Rule]] = MappingPr
 
 
 def checked_rule(text: str, rule: Rule) -> Rule:
-    """Return a rule that refuses what are no requests.
+    """Return a rule that fails in one sentence, and refuses what are no requests.
 
     :param text: name of the rule, for the error message
     :param rule: the rule
 
-    :raises ValueError: in the rule, if it returned something else than True or False for each of the others
+    :raises ValueError: in the rule, if it failed, or returned something else than True or False for each of the others
     """
 
     def checked(view: View) -> np.ndarray:
-        answer: Any = rule(view)
+        try:
+            answer: Any = rule(view)
+        except Exception as error:  # whatever a foreign function raises
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            raise ValueError(
+                f"Rule {text!r} failed in {os.path.basename(place.filename)}, line {place.lineno} "
+                f"({type(error).__name__}: {error})."
+            ) from error
         shape, bits = view.pos.shape[:-1], answer
         if type(answer) is not np.ndarray or answer.dtype != bool:
             try:

@@ -497,25 +497,28 @@ class SwarmConfig:
         beyond = np.maximum(low - corners, corners - high).max(axis=0)
         if beyond.max() <= self._leeway:
             return
-        field = extent.field if beyond[:2].max() > self._leeway else "heights"
+        beside, above = beyond[:2].max(), beyond[2]
         wider = np.array([[-r, -r, extent.low], [r, r, extent.high]])
         wider = np.array([np.minimum(low, wider[0]), np.maximum(high, wider[1])]).round(3).tolist()
-        value = getattr(self.space, field)
-        if field == "heights":
-            fitting = [value[0] + max(low[2] - extent.low, 0.0), value[1] - max(extent.high - high[2], 0.0)]
-        else:
-            most = np.max(value) - beyond[:2].max()
-            fitting = [min(np.min(value), most), most]
-        within = [math.ceil(round(100 * fitting[0], 6)) / 100, math.floor(round(100 * fitting[1], 6)) / 100]
-        smaller = (
-            ""
-            if within[0] > within[1] or within[1] <= 0
-            else (f"space.{field}={within if isinstance(value, tuple) else within[1]}, or ")
-        )
+        fitting: dict[str, list[float]] = {}  # fields that are too large, and the range that is not
+        if beside > self._leeway:
+            value = getattr(self.space, extent.field)
+            most = np.max(value) - beside
+            fitting[extent.field] = _inwards(min(np.min(value), most), most)
+        if above > self._leeway:
+            lowest, highest = self.space.heights
+            fitting["heights"] = _inwards(lowest + max(low[2] - extent.low, 0), highest - max(extent.high - high[2], 0))
+        field, smaller = next(iter(fitting)), ""
+        if all(least <= most and most > 0 for least, most in fitting.values()):
+            parts = (
+                f"space.{name}={found if isinstance(getattr(self.space, name), tuple) else found[1]}"
+                for name, found in fitting.items()
+            )
+            smaller = f"{' and '.join(parts)}, or "
         raise ValueError(
-            f"space.{field}={value}: starts and goals of {scenario!r} lie up to {beyond.max():.3g} m outside the "
-            f"workspace; give {smaller}planner.workspace_low={wider[0]} and planner.workspace_high={wider[1]}, which "
-            "`make_config` also does if both are left out."
+            f"space.{field}={getattr(self.space, field)}: starts and goals of {scenario!r} lie up to "
+            f"{beyond.max():.3g} m outside the workspace; give {smaller}planner.workspace_low={wider[0]} and "
+            f"planner.workspace_high={wider[1]}, which `make_config` also does if both are left out."
         )
 
     @property
@@ -618,6 +621,11 @@ def make_config(
     with contextlib.suppress(AttributeError, TypeError, ValueError, OverflowError):  # the check of the fields tells
         changes = _with_followers(base, changes)
     return replaced(base, changes)
+
+
+def _inwards(least: float, most: float) -> list[float]:
+    """Round the bounds of a range to centimetres that lie in it."""
+    return [math.ceil(round(100 * least, 6)) / 100, math.floor(round(100 * most, 6)) / 100]
 
 
 def for_scenario(config: SwarmConfig, scenario: str | Mapping[str, float]) -> SwarmConfig:
