@@ -503,7 +503,7 @@ def _rows_of_csv(path: Path) -> tuple[list[dict[str, Any]], np.ndarray, int]:
     with path.open(encoding="utf-8-sig", newline="") as file:
         table = csv.DictReader(file)
         rows: list[dict[str, Any]] = list(table)
-    titles = table.fieldnames or ()
+        titles = table.fieldnames or ()
     missing = [name for name in ("time", "robot", *_STATE[:3]) if name not in titles]
     if missing and any(";" in title or "\t" in title for title in titles):
         raise ValueError("its columns are separated by semicolons or tabs: separate them by commas")

@@ -233,10 +233,8 @@ def checked_rule(text: str, rule: Rule) -> Rule:
             answer: Any = rule(view)
         except Exception as error:  # whatever a foreign function raises
             place = traceback.extract_tb(error.__traceback__)[-1]
-            raise ValueError(
-                f"Rule {text!r} failed in {os.path.basename(place.filename)}, line {place.lineno} "
-                f"({type(error).__name__}: {error})."
-            ) from error
+            where = "" if place.filename == __file__ else f" in {os.path.basename(place.filename)}, line {place.lineno}"
+            raise ValueError(f"Rule {text!r} failed{where} ({type(error).__name__}: {error}).") from error
         shape, bits = view.pos.shape[:-1], answer
         if type(answer) is not np.ndarray or answer.dtype != bool:
             try:

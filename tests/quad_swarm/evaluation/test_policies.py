@@ -263,7 +263,7 @@ def test_a_function_of_a_view_is_a_rule():
 @pytest.mark.parametrize(
     ("rule", "message"),
     [
-        (lambda: True, r"<lambda>: the rule failed \(TypeError"),
+        (lambda: True, r"Rule '<lambda>' failed \(TypeError"),
         (lambda view: None, "Rule '<lambda>' returned None: it must return True or False"),
         (lambda view: view.pos, "Rule '<lambda>' returned .*shape \\(1, 4, 3\\)"),
     ],

@@ -82,7 +82,7 @@ def test_a_laboratory_needs_five_columns(tmp_path):
         ("", "columns"),
         ("time,robot,x,y\n0,0,0,0\n", "has no z"),
         ("time,robot,x,y,z\n0,0,0,0,0\n0,1,0,0,0\n", "2 to 1000000 times"),
-        ("time,robot,x,y,z\n0,0,0,0,0\n0,2,0,0,0\n1,0,0,0,0\n1,2,0,0,0\n", "count from 0"),
+        ("time,robot,x,y,z\n0,0,0,0,0\n0,2,0,0,0\n1,0,0,0,0\n1,2,0,0,0\n", "numbers 0, 2: count them from 0"),
         ("time,robot,x,y,z\n0,0,0,0,0\n0,1,0,0,0\n1,0,0,0,0\n", "one row for each"),
         ("time,robot,x,y,z\n0,0,0,0,0\n0,1,0,0,nan\n1,0,0,0,0\n1,1,0,0,0\n", "finite"),
         ("time,robot,x,y,z\n0,0,0,0,far\n", "far"),
