@@ -190,7 +190,7 @@ def test_only_collisions_are_recorded_on_request(tmp_path, capsys):
         (["--flight", "missing.csv"], "missing.csv"),
         (["--flight", "lab.bag"], ".npz, .csv, .mcap"),
         (["--flight", "one.csv"], "one.csv holds one robot"),
-        (["--flight", "short.csv"], "short.csv is no recording of a flight: 'it needs the columns"),
+        (["--flight", "short.csv"], "short.csv is no recording of a flight: it needs the columns"),
         (["--policy", "none", "--record", "a.bag"], ".npz, .csv, .mcap"),
         (["--policy", "none", "--record-collided"], "--record-collided needs --record"),
         (["--policy", "none", "--record", "a.npz", "--episodes", "300"], "1200 episodes would be 1200 files"),

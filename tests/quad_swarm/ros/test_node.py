@@ -10,7 +10,7 @@ from quad_swarm.ros import node as nodes
 
 def test_without_ros_it_is_said_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "rclpy", None)
-    with pytest.raises(ImportError, match=r"setup\.bash.*sb3-maddpg\[ros\]"):
+    with pytest.raises(ImportError, match=r"setup\.bash.*pip install -e '\.\[ros\]'"):
         nodes.make_node("alone")
 
 
