@@ -509,6 +509,8 @@ def _rows_of_csv(path: Path) -> tuple[list[dict[str, Any]], np.ndarray, int]:
         raise ValueError("its columns are separated by semicolons or tabs: separate them by commas")
     if missing:
         raise ValueError(f"it needs the columns time, robot, x, y and z, and has no {', '.join(missing)}")
+    if not rows:
+        raise ValueError("it has no rows")
     for line, row in enumerate(rows, start=2):
         row["time"], row["robot"] = _number(row, "time", line), _number(row, "robot", line)
         if not row["robot"].is_integer():

@@ -11,6 +11,7 @@ from network import alone
 from quad_swarm.evaluation.flight import Condition, begin, first_episode
 from quad_swarm.evaluation.real_time import episodes, main
 from quad_swarm.evaluation.recordings import read
+from quad_swarm.task.rules import RULES
 from quad_swarm.world.presets import make_config
 
 MODEL = "pretrained:quad-swarm-flight"
@@ -88,7 +89,7 @@ def test_a_learned_policy_flies_over_udp(tmp_path, capsys):
     assert not [name for name in row["counts"] if name.startswith("errors")]
 
 
-RULES = """
+MODULE = """
 import numpy as np
 from quad_swarm.task.rules import RULES
 
@@ -107,7 +108,7 @@ RULES["nearest_one"] = (nearest, ())
 def test_a_rule_from_the_current_folder_flies_in_the_robots_processes(tmp_path, link):
     if link == "ros2":
         pytest.importorskip("rclpy")
-    (tmp_path / "my_rules.py").write_text(RULES)
+    (tmp_path / "my_rules.py").write_text(MODULE)
     fly = [*alone(), sys.executable, "-m", "sb3_maddpg", "fly", "--gym-packages", "my_rules", "--json", "rows.json"]
     words = ["--policy", "nearest_one", "--n-robots", "3", "--most", "3", "--link", link]
     done = subprocess.run([*fly, *words], cwd=tmp_path, capture_output=True, text=True, timeout=500, check=False)
@@ -120,7 +121,9 @@ def test_a_rule_from_the_current_folder_flies_in_the_robots_processes(tmp_path, 
     ("words", "told"),
     [
         (["--policy", "sometimes"], "sometimes"),
+        (["--policy", "robotz"], "There is no folder of that name either"),
         (["--policy", "cpa:0.7:1.5&push:0.1"], "joins"),
+        (["--policy", "none", "--world", "separation=0.7"], "did you mean planner.separation?"),
         (["--policy", "none", "--loss", "2"], "loss=2.0"),
         (["--policy", "none", "--episodes", "0"], "--episodes 0"),
         (["--policy", "none", "--wait", "0.06"], "wait=0.06"),
@@ -135,6 +138,15 @@ def test_wrong_words_are_one_line(words, told, capsys):
     assert error.startswith("error: ")
     assert told in error
     assert len(error.splitlines()) == 1
+
+
+def test_a_rule_that_fails_ends_the_command_before_the_first_flight(monkeypatch, capsys):
+    monkeypatch.setitem(RULES, "broken", (lambda: lambda view: view.position, ()))
+    assert main(["--policy", "none", "broken", "--n-robots", "2", "--link", "virtual"]) == 1
+    printed = capsys.readouterr()
+    assert "Rule 'broken' failed in test_real_time.py, line " in printed.err
+    assert "has no attribute 'position'" in printed.err
+    assert "flight 1" not in printed.err
 
 
 @pytest.mark.slow

@@ -80,6 +80,10 @@ def test_a_laboratory_needs_five_columns(tmp_path):
     ("content", "told"),
     [
         ("", "columns"),
+        ("time,robot,x,y,z\n", "it has no rows"),
+        ("time;robot;x;y;z\n0;0;0;0;0\n", "separated by semicolons or tabs: separate them by commas"),
+        ("time,robot,x,y,z\n0,cf1,0,0,0\n", "line 2: robot='cf1' is no number"),
+        ("time,robot,x,y,z,roll,pitch,yaw\n0,0,0,0,0,2,-15,0\n1,0,0,0,0,2,-15,0\n", "up to 15: give attitudes in rad"),
         ("time,robot,x,y\n0,0,0,0\n", "has no z"),
         ("time,robot,x,y,z\n0,0,0,0,0\n0,1,0,0,0\n", "2 to 1000000 times"),
         ("time,robot,x,y,z\n0,0,0,0,0\n0,2,0,0,0\n1,0,0,0,0\n1,2,0,0,0\n", "numbers 0, 2: count them from 0"),
