@@ -5,9 +5,10 @@ nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios 
 ``rules``, ``teams`` (four and twelve) and ``none``; set 701 ``learned`` (version 1's model), ``hummingbird`` and
 ``crazyflie`` (the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and
 ``crowd`` (full communication of sixteen) in all scenarios; set 702 ``identified``, RotorPy's Hummingbird with its own
-model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five
-times as often. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written after each
-part, so that a run that is ended keeps what it has.
+model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five times as often;
+set 704 the same of four, twelve and sixteen (``four_again``, ``twelve_again``, ``crowd_again``). JSON: one row per
+policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run that is ended
+keeps what it has.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from studies.swarm.experiment import condition
 from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import world
 
-SEALED, LATER, LAST, MORE = 700, 701, 702, 703
+SEALED, LATER, LAST, MORE, AGAIN = 700, 701, 702, 703, 704
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -84,6 +85,9 @@ PARTS = {
     "twelve": Part(("full",), EVERYWHERE, (12,), 2000, LATER),
     "crowd": Part(("full",), EVERYWHERE, (16,), 2000, LATER),
     "eight": Part(("full",), EVERYWHERE, (8,), 10000, MORE),
+    "four_again": Part(("full",), EVERYWHERE, (4,), 10000, AGAIN),
+    "twelve_again": Part(("full",), EVERYWHERE, (12,), 10000, AGAIN),
+    "crowd_again": Part(("full",), EVERYWHERE, (16,), 10000, AGAIN),
 }
 
 
@@ -154,11 +158,13 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     with make_pool(args.jobs) as pool:
         for name in args.part:
-            found = list(fly(PARTS[name], args.episodes, pool))
-            rows += found
+            found = []
+            for row in fly(PARTS[name], args.episodes, pool):
+                found.append(row)
+                if args.json:
+                    write_rows(args.json, [*rows, *found])
             print(table(found), flush=True)
-            if args.json:
-                write_rows(args.json, rows)
+            rows += found
 
 
 if __name__ == "__main__":
