@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from quad_swarm.errors import shown, unknown_name
-from quad_swarm.quadrotor import QuadrotorParams
+from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorParams
 from quad_swarm.validation import MOST_CHARACTERS, read_yaml, replaced
 
 VEHICLES: dict[str, QuadrotorParams] = {
@@ -64,8 +64,8 @@ def load_vehicle(name: str | os.PathLike[str]) -> QuadrotorParams:
     """Load the parameters of a vehicle.
 
     :param name: a name of `VEHICLES`, or the path of a vehicle file (as a text: ``.yml``)
-    :raises ValueError: if the name is unknown, or the file cannot be read or is not a valid vehicle file; the message
-        names the file
+    :raises ValueError: if the name is unknown, or the file cannot be read, is not a valid vehicle file or lacks one of
+        `quad_swarm.quadrotor.VEHICLE_PARAMETERS`; the message names the file
     :raises FileNotFoundError: if there is no such file
     """
     if isinstance(name, str) and not name.endswith((".yml", ".yaml")):
@@ -92,6 +92,13 @@ def load_vehicle(name: str | os.PathLike[str]) -> QuadrotorParams:
             "vehicle's values under `parameters`."
         ) from None
     try:
-        return replaced(QuadrotorParams(), {str(parameter): value for parameter, value in values.items()})
+        vehicle = replaced(QuadrotorParams(), {str(parameter): value for parameter, value in values.items()})
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+    if missing := [name for name in VEHICLE_PARAMETERS if name not in values]:
+        others = ", ".join(f"{name}: {getattr(vehicle, name)}" for name in missing)
+        raise ValueError(
+            f"{path} lacks {', '.join(missing)}: a vehicle file has all parameters of its vehicle, so that it does not "
+            f"fly with those of another. Add your own; the Bebop 2 has {others}."
+        )
+    return vehicle

@@ -62,7 +62,12 @@ def _draw_front(axes: Axes, preset: str, rules: Rows, sweep: Rows, tests: Rows) 
         label="hand-made rules, each setting tried (250 to 12,000 episodes)",
     )
     best = sorted((s, c) for s, c in tried if not any(s2 <= s and c2 < c for s2, c2 in tried))
-    axes.plot(*zip(*best, strict=True), color=RULES, drawstyle="steps-post", label="the best rules, sealed flights")
+    axes.plot(
+        *zip(*best, strict=True),
+        color=RULES,
+        drawstyle="steps-post",
+        label="best rules for up to 12 (left) and 16 robots",
+    )
     learned = sorted((r for r in sweep if is_model(r["policy"])), key=lambda r: r["request_share"])
     if learned:
         shares = [r["request_share"] for r in learned]
@@ -125,10 +130,16 @@ def draw_flight_fronts(tried: Rows, sealed: Rows, path: Path) -> None:
             label="hand-made rules: settings that were tried",
         )
         learned = [r for r in flown if is_model(r["policy"])]
-        _points(axes, [r for r in flown if r["policy"].startswith("cpa")], "D", INK, "the best rules, sealed flights")
-        _points(axes, learned, "*", LEARNED, "learned, five seeds at two thresholds, sealed flights")
+        _points(
+            axes,
+            [r for r in flown if r["policy"].startswith("cpa")],
+            "D",
+            INK,
+            "best rules for up to 12 (left) and 16 robots",
+        )
+        _points(axes, learned, "*", LEARNED, "five models, thresholds for up to 12 (left) and 16")
         full = [r for r in flown if r["policy"] == "full"]
-        _points(axes, full, "s", COLOURS[0], "full communication, sealed flights")
+        _points(axes, full, "s", COLOURS[0], "full communication, in both sealed sets")
         axes.set_title(f"{'Eight' if n == 8 else 'Sixteen'} robots, symmetric swap")
         axes.set_xscale("log")
         axes.set_xlim(2e-3, 1.3)

@@ -3,8 +3,9 @@
 import os
 
 import pytest
+import yaml
 
-from quad_swarm.quadrotor import QuadrotorParams
+from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorParams
 from quad_swarm.vehicles import VEHICLES, load_vehicle
 from quad_swarm.world.presets import make_config
 
@@ -76,6 +77,16 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
 
 def test_paths_may_be_objects_and_numbers_are_decimal(tmp_path):
     path = tmp_path / "vehicle.txt"
-    path.write_text("# mine\nparameters: {drag_x: 010, drag_y: 1e-1}\nresiduals: {roll_rms: 0.1}\n")
+    rest = "".join(f", {name}: 1" for name in VEHICLE_PARAMETERS if not name.startswith("drag"))
+    path.write_text(f"# mine\nparameters: {{drag_x: 010, drag_y: 1e-1{rest}}}\nresiduals: {{roll_rms: 0.1}}\n")
     for make in (lambda: make_config("paper", quadrotor=path), lambda: make_config("paper", {"quadrotor": path})):
-        assert make().quadrotor == QuadrotorParams(drag_x=10.0, drag_y=0.1)
+        assert make().quadrotor == QuadrotorParams(9.81, 10.0, 0.1, *6 * [1.0])
+
+
+def test_a_file_that_lacks_a_parameter_is_not_completed_with_another_vehicle(tmp_path):
+    path = tmp_path / "vehicle.yml"
+    given = {name: 1.0 for name in VEHICLE_PARAMETERS}
+    del given["drag_y"], given["climb_gain"]
+    path.write_text(yaml.safe_dump({"parameters": given}))
+    with pytest.raises(ValueError, match=r"lacks drag_y, climb_gain: .* Bebop 2 has drag_y: 0\.33, climb_gain: 1\.227"):
+        make_config("flight", quadrotor=path)

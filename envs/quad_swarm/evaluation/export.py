@@ -7,6 +7,8 @@ and the program's digest. `quad_swarm.robot.files.load` reads it, without PyTorc
 from __future__ import annotations
 
 import importlib
+import shutil
+import tempfile
 from importlib.metadata import version
 from pathlib import Path
 
@@ -42,21 +44,25 @@ def export(model: str, config: SwarmConfig, folder: Path, algo: str = "sb3_maddp
         raise ValueError(f"{model}: its robots have different actors, but load one; train with share_actor=True.")
     actor = predictor.agent_policy(0)
     known = [k for k, column in enumerate(observation.columns) if ".critic." not in column.name]
-    folder.mkdir(parents=True, exist_ok=True)
-    with needs_extra("export", "onnx"):
-        actor.of_columns(known).export(folder / files.ACTOR)
     given = {name: value for name, value in trained_in(loaded).items() if name in OBSERVATION_ARGUMENTS}
-    written = files.RobotFiles(
-        folder,
-        config,
-        given.get("observation", "paper"),
-        bool(given.get("scale_observation", False)),
-        n_bits,
-        getattr(getattr(loaded, "policy", None), "threshold", None),
-        short_name(model.partition("@")[0]),
-    )
-    versions = {name: version(name) for name in ("sb3-maddpg", "torch", "onnx")}
-    files.write(written, [observation.columns[k].name for k in known], versions)
+    with tempfile.TemporaryDirectory(prefix="quad-swarm-") as temporary:  # an export that fails leaves nothing
+        part = Path(temporary)
+        with needs_extra("export", "onnx"):
+            actor.of_columns(known).export(part / files.ACTOR)
+        written = files.RobotFiles(
+            part,
+            config,
+            given.get("observation", "paper"),
+            bool(given.get("scale_observation", False)),
+            n_bits,
+            getattr(getattr(loaded, "policy", None), "threshold", None),
+            short_name(model.partition("@")[0]),
+        )
+        versions = {name: version(name) for name in ("sb3-maddpg", "torch", "onnx")}
+        files.write(written, [observation.columns[k].name for k in known], versions)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (files.ACTOR, files.DESCRIPTION):
+            shutil.move(part / name, folder / name)
     return files.load(folder)
 
 

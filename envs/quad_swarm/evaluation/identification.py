@@ -40,6 +40,7 @@ def identify_logs(paths: Sequence[Path]) -> Fit:
     :raises ImportError: if the extra ``plants`` is not installed, or ``record``, which ``.mcap`` needs
     """
     logs = [_log(path, read(path)) for path in paths]
+    print("fitting: seconds, or a minute for twenty minutes of flight at 100 Hz", file=sys.stderr, flush=True)
     try:
         return fit(logs)
     except ValueError as error:

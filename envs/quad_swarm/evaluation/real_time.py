@@ -277,7 +277,10 @@ def make_parser() -> Parser:
         "--live", type=int, nargs="?", const=0, metavar="PORT", help="show the flights on a web page of this machine"
     )
     parser.add_argument(
-        "--record", type=Path, metavar="FILE", help="record the flights as .npz, .csv or .mcap; several get numbers"
+        "--record",
+        type=Path,
+        metavar="FILE",
+        help="record the flights as .npz, .csv or .mcap; several get numbers, and none is overwritten",
     )
     parser.add_argument("--gym-packages", nargs="+", action="extend", metavar="MODULE", help="modules to import first")
     parser.add_argument("--algo", default="sb3_maddpg:MADDPG", metavar="MODULE:CLASS", help="class that loads models")
@@ -415,10 +418,17 @@ class _Recorder:
     :param path: path of a single one
     :param config: the world
     :param count: number of flights
+    :raises ValueError: if there is such a file already
     """
 
     def __init__(self, path: Path, config: SwarmConfig, count: int):
         self._path, self._config, self._count, self._written = path, config, count, 0
+        for number in range(1, count + 1):
+            if (there := numbered(path, number, count)).is_file():
+                raise ValueError(
+                    f"--record {path}: {there} is there already, and no flight is overwritten; remove it, or choose "
+                    "another name."
+                )
 
     def begin(self, policy: str, scene: Scene) -> None:
         """See `Watcher`."""

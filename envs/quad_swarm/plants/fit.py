@@ -302,13 +302,14 @@ def _fit(windows: _Windows, start: _Fitted | None = None) -> _Fitted:
     low = np.repeat([_TIME_CONSTANTS[0], _GAINS[0], _DELAYS[0]], [3, 3, robots])
     high = np.repeat([_TIME_CONSTANTS[1], _GAINS[1], _DELAYS[1]], [3, 3, robots])
     if start is None:
-        x = np.repeat([0.2, 1.0, 0.0], [3, 3, robots])
-    else:
+        x, tol = np.repeat([0.2, 1.0, 0.0], [3, 3, robots]), 1e-8
+    else:  # for standard errors
+        tol = 1e-5
         names = [f"{name}_time_constant" for name in _LAGS] + [f"{name}_gain" for name in _LAGS]
         x = np.concatenate([[start.values[name] for name in names], start.delays])
     for _ in range(2):
         x = np.clip(x, low + 1e-6, high - 1e-6)
-        x = least_squares(lambda x: residuals(x).ravel(), x, jacobian, (low, high), x_scale="jac").x
+        x = least_squares(lambda x: residuals(x).ravel(), x, jacobian, (low, high), ftol=tol, xtol=tol, x_scale="jac").x
         scale = scale * np.maximum(residuals(x).std(axis=(1, 2)), 1e-9)
     values = {f"{name}_gain": float(x[3 + k]) for k, name in enumerate(_LAGS)}
     values |= {f"{name}_time_constant": float(x[k]) for k, name in enumerate(_LAGS)}

@@ -8,10 +8,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import yaml
 
 from quad_swarm.evaluation.command import COLUMNS, main
 from quad_swarm.plants import remote
 from quad_swarm.plants.base import simulated_vehicles
+from quad_swarm.quadrotor import VEHICLE_PARAMETERS
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS, without_obstacles
@@ -193,7 +195,8 @@ def test_files_say_what_was_flown(tmp_path, capsys):
     vehicle = tmp_path / "vehicle.yml"
     seen = []
     for drag in (0.2, 0.3):
-        vehicle.write_text(f"parameters: {{drag_x: {drag}}}")
+        content = {name: drag for name in VEHICLE_PARAMETERS}
+        vehicle.write_text(yaml.safe_dump({"parameters": content}))
         seen.append(table(tmp_path / "a.json", "--world", f"quadrotor={vehicle}", "radius=0.31")["world"])
     assert [world["quadrotor"]["drag_x"] for world in seen] == [0.2, 0.3]
     assert seen[0]["planner"] == {"separation": pytest.approx(0.62)}

@@ -6,6 +6,7 @@ import pytest
 
 from quad_swarm.evaluation.export import export, main
 from quad_swarm.evaluation.policies import fitted, load_model
+from quad_swarm.robot import files
 from quad_swarm.robot.files import load
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
@@ -44,6 +45,16 @@ def test_teams_whose_robots_have_different_actors_are_refused(share, tmp_path):
     with pytest.raises(ValueError, match="its robots have different actors"):
         export(str(path), make_config("paper", n_robots=3), tmp_path / "robots")
     assert not (tmp_path / "robots").exists()
+
+
+def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
+    def broken(*args):
+        raise ValueError("the disc is full")
+
+    monkeypatch.setattr(files, "write", broken)
+    with pytest.raises(ValueError, match="disc is full"):
+        export(MODEL, make_config("flight", n_robots=2), tmp_path / "robots")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

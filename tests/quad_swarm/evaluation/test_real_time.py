@@ -40,6 +40,14 @@ def test_flights_among_obstacles(tmp_path, capsys):
     assert 0 < distance.min() < 1
 
 
+def test_recordings_are_not_overwritten(tmp_path):
+    (tmp_path / "flight_2.csv").write_text("mine")
+    words = ["--policy", "none", "--n-robots", "2", "--link", "virtual", "--episodes", "2"]
+    with pytest.raises(ValueError, match=r"flight_2\.csv is there already, and no flight is overwritten"):
+        main([*words, "--record", str(tmp_path / "flight.csv"), "--debug"])
+    assert [one.read_text() for one in tmp_path.iterdir()] == ["mine"]
+
+
 @pytest.mark.parametrize("scenario", ["tour", "moving_goals"])
 def test_goals_that_change_are_not_flown_in_real_time(scenario):
     with pytest.raises(ValueError, match=f"scenario='{scenario}': its goals change in flight"):

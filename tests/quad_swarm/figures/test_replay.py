@@ -196,7 +196,7 @@ def test_counters_are_the_sums_of_what_was_asked(view, pages):
         total = sum(map(len, flight["requests"]))
         summary = article.locator(".summary").inner_text()
         assert f"{len(flight['requests'])} steps" in summary
-        assert re.search(rf"\b{total} of {12 * len(flight['requests'])} requests", summary)
+        assert re.search(rf"\b{total} of {12 * len(flight['requests'])} plans sent", summary)
         told = article.locator("path.lane").evaluate_all("lanes => lanes.map(lane => Number(lane.dataset.steps))")
         assert sum(told) == total
 
@@ -386,7 +386,7 @@ def test_announced_plans_are_drawn_and_counted_apart_from_requests(view, pages):
     sent = sum(map(len, steps[: step + 1]))
     assert page.locator(".count").last.inner_text().split()[:3] == [str(sent), "plans", "sent"]
     assert "plans sent (" in page.locator(".summary").last.inner_text()
-    assert "A plan is sent in answer to a request, or announced" in page.locator("#about-text").text_content()
+    assert "A plan is sent in answer to each request, or announced" in page.locator("#about-text").text_content()
     text = pages["told"].read_text()
     pages["solid"] = pages["told"].with_name("solid.html")
     pages["solid"].write_text(text.replace("discard;", ";"))

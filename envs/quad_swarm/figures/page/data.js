@@ -55,9 +55,7 @@ export const scenario = capital(data.scenario.replaceAll("_", " "));
 export const title = `${scenario}, ${nRobots} robots`;
 const source = data.source ?? `held-out episode ${data.episode} (set ${data.seed})`;
 export const subtitle = [source, ...data.world].join(", ");
-// Announced plans are counted, too
-const announcing = flights.some(flight => flight.announces);
-export const counted = number => announcing ? (number === 1 ? "plan sent" : "plans sent") : (number === 1 ? "request" : "requests");
+export const counted = number => number === 1 ? "plan sent" : "plans sent";
 export const fileName = `${data.scenario}_${nRobots}_robots`;
 export const fullName = flight => `${flight.name} (${flight.detail})`;
 

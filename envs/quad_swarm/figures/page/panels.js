@@ -100,10 +100,12 @@ function set(node, text) {
 
 const alike = radii.every(radius => radius === data.radius), obstacles = flights.flatMap(flight => flight.obstacles);
 
+const stages = flights[0].plans[0][0].length - 1; // 0 of recordings without plans
+
 export const legend = [
   ["arc", "request: from the robot that asks to the one it asks; a light runs there and returns with the plan"],
   ...(flights.some(flight => flight.announces) ? [["arc announced", "announced plan, sent unasked: from the robot whose plan it is; a light runs there"]] : []),
-  ["tube", `plan for the next ${seconds((flights[0].plans[0][0].length - 1) * data.plan_stride)}`],
+  ...(stages ? [["tube", `plan for the next ${seconds(stages * data.plan_stride)}`]] : []),
   ["goal", "goal of the robot of this colour"],
   ["bubble", `safety bubble, radius ${alike ? data.radius : `${Math.min(...radii)} to ${largest}`} m${downwash === 1 ? "" : `, ${downwash} times as high as wide`}: two that touch are a collision`],
   ...(obstacles.length ? [["body", `obstacle${obstacles.some(one => one.moves) ? ", some fly straight on" : ""}: a robot ${alike ? `closer than ${data.radius} m` : "whose bubble it touches"} collides`]] : []),
@@ -115,8 +117,8 @@ export const legend = [
 
 export const about = `${nRobots} quadrotors fly from where they start to the rings of their colours. Each plans its own path every ` +
   `${seconds(1, 2)} and may ask others for their plans; of those it does not ask it assumes that they fly straight on. ` +
-  `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A request is one robot asking another in one step.` +
-  (flights.some(flight => flight.announces) ? " A plan is sent in answer to a request, or announced without one." : "") +
+  `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A plan is sent in answer to each request` +
+  `${flights.some(flight => flight.announces) ? ", or announced without one" : ""}.` +
   (obstacles.length ? " All know the obstacles: where they are, how large, and how fast." : "") +
   (alike ? "" : ` Distances between robots count from surface to surface, plus ${contact.toFixed(2)} m.`) +
   (downwash === 1 ? "" : ` They keep out of the air that others blow down: vertical parts of distances count 1 / ${downwash}.`);

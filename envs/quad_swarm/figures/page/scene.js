@@ -3,7 +3,7 @@
 import {
   AmbientLight, Color, DirectionalLight, HemisphereLight, PCFShadowMap, PerspectiveCamera, Scene, Vector3, WebGLRenderer,
 } from "three";
-import {data, flights, largest, position} from "./data.js";
+import {data, flights, largest, position, radii} from "./data.js";
 import {Ground} from "./ground.js";
 import {labelHeight, Swarm} from "./robots.js";
 import {isDark} from "./theme.js";
@@ -131,6 +131,8 @@ export class Views {
       const labelSize = rect.label / rect.height * 2 * Math.tan(FOV * Math.PI / 360);
       swarm.update(t, {fades, dark: this.dark, labelSize, size: [rect.width, rect.height]});
       const {position: from, target} = eye(view, swarm.positions);
+      // A camera inside a robot, or right behind it, would see nothing else
+      swarm.robots.forEach((robot, i) => { robot.group.visible = from.distanceTo(robot.group.position) > 2 * radii[i]; });
       camera.position.copy(from);
       camera.lookAt(target);
       camera.aspect = rect.width / rect.height;
