@@ -528,7 +528,7 @@ def glance_table(rows: Rows, best: str) -> str:
         elif times and full and chosen[0]["policy"] != "none":  # only those arrive there that met nobody
             later = spread([f"+{time / full - 1:.0%}" for time in times])
         lines.append([what + seeds, seeds_rate(chosen), spread([f"{share:.1%}" for share in sent]), later])
-    return table(["", "flights with a collision", "plans sent", "arrival (full) or later"], lines)
+    return table(["", "flights with a collision", "plans sent", "arrival, beside full"], lines)
 
 
 def seeds_rate(rows: Rows) -> str:

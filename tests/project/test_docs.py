@@ -40,6 +40,7 @@ NO_LEARNING = (
     "index",
     "faq",
     "files",
+    "autopilots",
     "robots",
 )
 PAGES = ("README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (*LEARNER, *SITE, *NO_LEARNING)))

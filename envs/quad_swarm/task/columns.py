@@ -200,7 +200,7 @@ def of_numbers(n_others: int) -> list[Column]:
 
 
 def as_table() -> str:
-    """Return a Markdown table of the columns of all groups, which `docs/robots.md` shows."""
+    """Return a Markdown table of the columns of all groups, which `docs/observation_columns.md` shows."""
     lines = ["| column | unit | frame | meaning |", "|---|---|---|---|"]
     for group, columns in {"own": OWN, **COLUMNS}.items():
         lines += [f"| `{group}.{name}` | {unit} | {frame} | {meaning} |" for name, unit, frame, meaning in columns]

@@ -46,4 +46,4 @@ def test_units_say_what_a_value_of_one_is():
 
 
 def test_the_table_in_the_docs_is_the_present_one():
-    assert columns.as_table() in (Path(__file__).parents[3] / "docs" / "robots.md").read_text()
+    assert columns.as_table() in (Path(__file__).parents[3] / "docs" / "observation_columns.md").read_text()
