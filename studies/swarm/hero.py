@@ -2,8 +2,9 @@
 
 All policies fly the same held-out episode. The page of `sb3-maddpg replay` draws each frame in a headless Chromium with
 its function ``renderFrame(seconds)``, so frames do not depend on the machine's speed. This writes ``hero-light.webp``
-and ``hero-dark.webp``. That of the README: ``--policy none full
-envs/quad_swarm/models/quad-swarm-flight/model.zip --preset flight``. It needs Playwright (extra `dev`) and Chromium; software rendering suffices.
+and ``hero-dark.webp``; the README's with ``--preset flight --policy none full``, and
+``envs/quad_swarm/models/quad-swarm-flight/model.zip``. It needs Playwright (extra `dev`) and Chromium; software
+rendering suffices.
 """
 
 from __future__ import annotations
