@@ -29,7 +29,7 @@ if repository := _urls.get("Repository"):  # `project.urls` in pyproject.toml
     html_theme_options |= {"source_repository": repository, "source_branch": "main", "source_directory": "docs/"}
 html_static_path = ["_static"]
 html_css_files = ["tables.css"]
-html_js_files = ["keyboard.js"]
+html_js_files = ["keyboard.js", "tablesort.min.js", "sort.js"]
 
 smartquotes_action = "qe"  # no dashes: options begin with two hyphens
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
