@@ -13,8 +13,10 @@ TEAMS ?= 6 12 16
 TEAM_FAMILIES ?= "distance" "event" "cpa" "cpa and stale" "cpa and event" "plan and stale" "plan, or cpa and stale" "two cpa"
 POLICIES ?= none full distance:4 "cpa:1.0s:3&soon:0.5|cpa:1.0s:3&stale:4"
 PEERS := agilerl benchmarl xuance
+ENV ?= mpe2/simple_spread_v3
+MAPPO ?= --algo mappo
 
-.PHONY: help install train test quick test-all test-lowest lint docs page bench bench-peers check-peers results results-quick clean
+.PHONY: help install train test quick test-all test-lowest lint docs page bench bench-peers check-peers mappo results results-quick clean
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
@@ -93,6 +95,9 @@ bench-peers: install $(PEERS:%=.bench/%/.installed)  ## training speed against o
 
 check-peers: install $(PEERS:%=.bench/%/.installed)  ## which action spaces the other libraries train on
 	$(BIN)/python -m benchmarks.peers.action_spaces --json benchmarks/results/action_spaces.json
+
+mappo: .bench/benchmarl/.installed  ## MAPPO or IPPO of BenchMARL in ENV, as a baseline (MAPPO="--algo ippo --steps 500000")
+	.bench/benchmarl/bin/python -m benchmarks.peers.mappo --env $(ENV) $(MAPPO)
 
 .bench/%/.installed: benchmarks/peers/%.txt
 	$(PYTHON) -m venv .bench/$*

@@ -6,7 +6,8 @@ nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios 
 ``crazyflie`` (the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and
 ``crowd`` (full communication of sixteen) in all scenarios; set 702 ``identified``, RotorPy's Hummingbird with its own
 model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five times as often;
-set 704 the same of four, twelve and sixteen (``four_again``, ``twelve_again``, ``crowd_again``). JSON: one row per
+set 704 the same of four, twelve and sixteen (``four_again``, ``twelve_again``, ``crowd_again``); set 705
+``one_small`` and ``one_large``, one model of version 1 at one threshold, with four to sixteen robots. JSON: one row per
 policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run that is ended
 keeps what it has.
 """
@@ -30,13 +31,16 @@ from studies.swarm import delay_check
 from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import condition
 from studies.swarm.fly import CLEARANCE, DELAY_CHECK
-from studies.swarm.protocol import world
+from studies.swarm.protocol import models, world
 
-SEALED, LATER, LAST, MORE, AGAIN = 700, 701, 702, 703, 704
+SEALED, LATER, LAST, MORE, AGAIN, ONE = 700, 701, 702, 703, 704, 705
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
 MODELS = (LEARNED, f"{LEARNED}@0.05")
+# Of the five models, the one that sent least with eight and sixteen robots on validation episodes of version 2, none of
+# which collided; the threshold too
+ONE_MODEL = f"{models('flight')[4]}@0.5"
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
 CHECKED: dict[str, Any] = {"radio": {"jitter": 0}, "planner": {"commitment": 0.0}}
@@ -88,6 +92,8 @@ PARTS = {
     "four_again": Part(("full",), EVERYWHERE, (4,), 10000, AGAIN),
     "twelve_again": Part(("full",), EVERYWHERE, (12,), 10000, AGAIN),
     "crowd_again": Part(("full",), EVERYWHERE, (16,), 10000, AGAIN),
+    "one_small": Part((ONE_MODEL,), tuple(without_obstacles()), (4, 8), 4000, ONE),
+    "one_large": Part((ONE_MODEL,), tuple(without_obstacles()), (12, 16), 2000, ONE),
 }
 
 
