@@ -314,7 +314,9 @@ def read_yaml(text: str) -> Any:
     except RecursionError:
         raise ValueError("nested too deeply") from None
     except (yaml.YAMLError, TypeError, KeyError, AttributeError, OverflowError) as error:
-        raise ValueError("no valid YAML: " + " ".join(str(error).split())) from None
+        told, mark = getattr(error, "problem", None) or str(error), getattr(error, "problem_mark", None)
+        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise ValueError(f"no valid YAML: {where}{' '.join(told.split())}") from None
 
 
 def read_assignments(option: str, assignments: Iterable[str]) -> dict[str, Any]:

@@ -30,7 +30,8 @@ from sb3_maddpg.cli.show import load_model, run_settings
 from sb3_maddpg.cli.terminal import aligned
 from sb3_maddpg.common.evaluation import Episode, compare, play, summarise
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
-from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
+from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError, TeamError
+from sb3_maddpg.utils import shown
 
 RANDOM = "random"
 EXAMPLES = f"""\
@@ -107,10 +108,21 @@ def run(args: argparse.Namespace, words: list[str]) -> int:
     th.set_num_threads(1)
     prepared = [_prepare(one, env_id, options) for one in policies]
     given = next((kwargs for one, (_, _, kwargs) in zip(policies, prepared, strict=True) if one.path), None)
+    flown_in = {
+        one.name: kwargs if one.path is not None or given is None else given
+        for one, (_, _, kwargs) in zip(policies, prepared, strict=True)
+    }
+    if len({shown(kwargs, 1000) for kwargs in flown_in.values()}) > 1:
+        told = ", ".join(f"{name} with {shown(kwargs, 100)}" for name, kwargs in flown_in.items())
+        print(
+            f"The policies act in environments that differ, so that returns do not compare: {told} (those of their "
+            "trainings). Set them for all with --env-kwargs.",
+            file=sys.stderr,
+        )
     played: dict[str, list[Episode]] = {}
     with tqdm(total=len(policies) * options.episodes, disable=None, leave=False, unit="episode") as bar:
-        for one, (settings, statistics, kwargs) in zip(policies, prepared, strict=True):
-            own = kwargs if one.path is not None or given is None else given
+        for one, (settings, statistics, _) in zip(policies, prepared, strict=True):
+            own = flown_in[one.name]
             played[one.name] = []
             with closing(_environment(env_id, settings, statistics, own, options.seed)) as env:
                 model = None if one.path is None else _load(one, env_id, env, settings, options)
@@ -118,7 +130,10 @@ def run(args: argparse.Namespace, words: list[str]) -> int:
                     played[one.name].append(episode)
                     bar.update()
     rival, files = played[policies[0].name], {one.name: one.path for one in policies}
-    rows = [_row(name, files[name], env_id, options.seed, episodes, rival) for name, episodes in played.items()]
+    rows = [
+        _row(name, files[name], env_id, flown_in[name], options.seed, episodes, rival)
+        for name, episodes in played.items()
+    ]
     print(tables(rows), file=sys.stderr if options.json == "-" else sys.stdout)
     if options.json is not None:
         _write_json(options.json, rows)
@@ -179,7 +194,15 @@ def _load(policy: Policy, env_id: str, env: VecEnv, settings: Mapping[str, Any],
     shares = shares_parameters(cls, env_id)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".* was trained with VecNormalize")  # as `_Normalising` does
-        model = load_model(cls, policy.path, shares, env, settings, options.seed, options.device)
+        try:
+            model = load_model(cls, policy.path, shares, env, settings, options.seed, options.device)
+        except TeamError:
+            raise
+        except Exception as error:  # SB3 does not check whose file it loads
+            raise InvalidFileError(
+                f"{policy.path} is no model of {cls.__name__} ({shown(str(error), 200)}): pass it as ALGO:MODEL.zip "
+                "with the algorithm that trained it, such as maddpg."
+            ) from error
     if isinstance(model, TeamAlgorithm):
         _check_team(policy, model, env)
     alone = isinstance(model, TeamAlgorithm) and model.normalized_observations and unwrap_vec_normalize(env) is None
@@ -211,12 +234,19 @@ class _Normalising:
 
 
 def _row(
-    name: str, path: Path | None, env_id: str, seed: int, episodes: Sequence[Episode], rival: Sequence[Episode]
+    name: str,
+    path: Path | None,
+    env_id: str,
+    env_kwargs: Mapping[str, Any],
+    seed: int,
+    episodes: Sequence[Episode],
+    rival: Sequence[Episode],
 ) -> dict[str, Any]:
     row = {
         "policy": name,
         "model": None if path is None else str(path),
         "env": env_id,
+        "env_kwargs": dict(env_kwargs),
         "seed": seed,
         **summarise(episodes),
     }

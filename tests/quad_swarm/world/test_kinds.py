@@ -11,7 +11,7 @@ import yaml
 from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly
 from quad_swarm.evaluation.recordings import Recording
 from quad_swarm.planner import MixedPlanner, Planner
-from quad_swarm.quadrotor import QuadrotorParams
+from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorParams
 from quad_swarm.task.observation import make_observation
 from quad_swarm.task.view import View
 from quad_swarm.validation import read_assignments, replaced
@@ -70,16 +70,13 @@ def test_a_kind_is_the_world_of_a_team_of_its_own():
 
 def test_parameters_of_a_vehicle_replace_some_of_the_world(tmp_path):
     path = tmp_path / "mine.yml"
-    path.write_text(yaml.safe_dump({"parameters": {"drag_x": 0.7}}))
+    mine = QuadrotorParams(drag_x=0.7)
+    path.write_text(yaml.safe_dump({"parameters": {name: getattr(mine, name) for name in VEHICLE_PARAMETERS}}))
     vehicles = [{"quadrotor": {"drag_y": 0.2}}, {"quadrotor": str(path)}, {"quadrotor": Path(path)}, {}]
     config = make_config("paper", {"vehicles": vehicles}, quadrotor="x500")
     x500 = VEHICLES["x500"]
     assert config.kinds[config.kind_of[0]].quadrotor == dataclasses.replace(x500, drag_y=0.2)
-    assert (
-        config.kinds[config.kind_of[1]].quadrotor
-        == config.kinds[config.kind_of[2]].quadrotor
-        == QuadrotorParams(drag_x=0.7)
-    )
+    assert config.kinds[config.kind_of[1]].quadrotor == config.kinds[config.kind_of[2]].quadrotor == mine
     assert config.kinds[config.kind_of[3]].quadrotor == x500
 
 

@@ -118,6 +118,17 @@ def test_arguments_of_the_environment_are_merged(here, capsys):
     assert evaluate(*words) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["length"]["mean"] == 4
+    assert row["env_kwargs"] == {"length": 4}
+
+
+def test_trainings_in_environments_that_differ_are_named(here, capsys, tmp_path):
+    words = ["train", "--algo", "maddpg", "--env", "two_v0", "--conf-file", "r.yml", "--env-kwargs", "length:5"]
+    assert main([*words, "--eval-freq", "-1", "-f", str(tmp_path), "--quiet"]) == 0
+    other = str(next((tmp_path / "maddpg").glob("two_v0_1/two_v0.zip")))
+    assert evaluate("--policy", "latest:logs", other, "--episodes", "2") == 0
+    assert f"latest:logs with {{}}, {other} with {{'length': 5}}" in capsys.readouterr().err
+    assert evaluate("--policy", "latest:logs", other, "--episodes", "2", "--env-kwargs", "length:4") == 0
+    assert "differ" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -133,6 +144,7 @@ def test_arguments_of_the_environment_are_merged(here, capsys):
         (("--policy", "random", "--episodes", "0"), "choose 1 or more"),
         (("--policy", "random", "--env-kwargs", "lenght:4"), "lenght"),
         (("--policy", "matd3:logs/maddpg/two_v0_1/two_v0.zip"), "MADDPG"),
+        (("--policy", "ppo:logs/maddpg/two_v0_1/two_v0.zip"), "two_v0.zip is no model of PPO"),
         ((), "--policy"),
     ],
 )

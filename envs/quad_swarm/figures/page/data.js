@@ -55,7 +55,9 @@ export const scenario = capital(data.scenario.replaceAll("_", " "));
 export const title = `${scenario}, ${nRobots} robots`;
 const source = data.source ?? `held-out episode ${data.episode} (set ${data.seed})`;
 export const subtitle = [source, ...data.world].join(", ");
-export const counted = number => number === 1 ? "plan sent" : "plans sent";
+// A recording of robots holds what they asked for, and a lost request is not answered. In simulations each is
+const asked = data.source !== undefined && !flights.some(flight => flight.announces);
+export const counted = number => (asked ? number === 1 ? "request" : "requests" : number === 1 ? "plan sent" : "plans sent");
 export const fileName = `${data.scenario}_${nRobots}_robots`;
 export const fullName = flight => `${flight.name} (${flight.detail})`;
 
