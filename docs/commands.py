@@ -21,7 +21,20 @@ def parser_of(command: str) -> Parser:
     return build_parser()[1][command]
 
 
+def shown(make: Callable[[], Parser]) -> Parser:
+    """
+    :param make: makes a parser
+    :return: the parser, with each example as a paragraph, since the page has no blocks of code here
+    """
+    parser = make()
+    title, colon, examples = (parser.epilog or "").partition(":\n")
+    if colon:
+        parser.epilog = "\n\n".join([f"{title}:", *map(str.strip, examples.splitlines())])
+    return parser
+
+
 # Functions by name, which is what the directive `argparse` takes
 FUNCTIONS: dict[str, Callable[[], Parser]] = {name: partial(parser_of, name) for name in COMMANDS}
 FUNCTIONS["evaluate_elsewhere"] = returns.make_parser
+FUNCTIONS = {name: partial(shown, make) for name, make in FUNCTIONS.items()}
 globals().update(FUNCTIONS)
