@@ -386,7 +386,7 @@ def test_announced_plans_are_drawn_and_counted_apart_from_requests(view, pages):
     sent = sum(map(len, steps[: step + 1]))
     assert page.locator(".count").last.inner_text().split()[:3] == [str(sent), "plans", "sent"]
     assert "plans sent (" in page.locator(".summary").last.inner_text()
-    assert "A plan is sent in answer to each request, or announced" in page.locator("#about-text").text_content()
+    assert "each request that arrives, or announced without one" in page.locator("#about-text").text_content()
     text = pages["told"].read_text()
     pages["solid"] = pages["told"].with_name("solid.html")
     pages["solid"].write_text(text.replace("discard;", ";"))
@@ -399,6 +399,18 @@ def test_announced_plans_are_drawn_and_counted_apart_from_requests(view, pages):
 def test_the_page_says_what_differs_from_the_preset(view):
     header = view("told").inner_text("header")
     assert "held-out episode 0 (set 0), noise.wind=1.5, plant=model" in header
+
+
+@pytest.mark.slow
+def test_a_recording_of_positions_has_requests_and_no_plans(view, pages, tmp_path):
+    flown = fly(Condition("full", "symmetric_swap", make_config("paper", n_robots=3), 20), 0)
+    write(tmp_path / "lab.csv", Recording.of(flown))
+    pages["lab"] = tmp_path / "lab.html"
+    words = ["--flight", str(tmp_path / "lab.csv"), "--world", "goal_radius=0.2", "--out", str(pages["lab"])]
+    assert main(words) == 0
+    page = view("lab", "step=5")
+    assert page.locator(".count").inner_text().split()[1] == "requests"
+    assert "plan for the next" not in page.inner_text("#legend")
 
 
 @pytest.mark.slow

@@ -117,7 +117,7 @@ export const legend = [
 
 export const about = `${nRobots} quadrotors fly from where they start to the rings of their colours. Each plans its own path every ` +
   `${seconds(1, 2)} and may ask others for their plans; of those it does not ask it assumes that they fly straight on. ` +
-  `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A plan is sent in answer to each request` +
+  `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A plan is sent in answer to each request that arrives` +
   `${flights.some(flight => flight.announces) ? ", or announced without one" : ""}.` +
   (obstacles.length ? " All know the obstacles: where they are, how large, and how fast." : "") +
   (alike ? "" : ` Distances between robots count from surface to surface, plus ${contact.toFixed(2)} m.`) +
