@@ -59,6 +59,10 @@ VEHICLES: dict[str, QuadrotorParams] = {
     ),
 }
 
+# Name -> `planner.downwash` of the vehicles for which somebody published one. The Crazyflie's firmware avoids others
+# with semi-axes of 0.3, 0.3 and 0.9 m (bitcraze/crazyflie-firmware, src/modules/src/collision_avoidance.c).
+DOWNWASH = {"crazyflie21": 3.0}
+
 
 def load_vehicle(name: str | os.PathLike[str]) -> QuadrotorParams:
     """Load the parameters of a vehicle.

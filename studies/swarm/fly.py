@@ -226,8 +226,9 @@ def flight(up_to: int) -> list[Job]:
 
 def _worlds(part: str, preset: str, changed: Row, names: Iterable[str], policies: Iterable[str]) -> Iterator[Job]:
     keys = {"part": part, "preset": preset, "changed": changed}
+    spheres = {**changed, "planner": {"downwash": 1.0, **changed.get("planner", {})}}
     for name, policy in itertools.product(names, policies):
-        yield Job(keys, [policy], name, make_config(preset, changed))
+        yield Job(keys, [policy], name, make_config(preset, spheres))
 
 
 def worlds() -> Iterator[Job]:

@@ -19,6 +19,26 @@ def test_worlds_take_names(name):
     assert make_config("flight", quadrotor=name).quadrotor == VEHICLES[name]
 
 
+NAMED = {"quadrotor": "crazyflie21"}
+
+
+@pytest.mark.parametrize(
+    ("preset", "world", "downwash"),
+    [
+        ("flight", {}, 1.0),
+        ("flight", NAMED, 3.0),
+        ("flight", {"quadrotor": "x500"}, 1.0),
+        ("flight", {**NAMED, "planner": {"separation": 0.9}}, 3.0),
+        ("flight", {**NAMED, "planner": {"downwash": 1.0}}, 1.0),
+        ("flight", {"vehicles": [{}, NAMED]}, 3.0),
+        ("flight", {"quadrotor": VEHICLES["crazyflie21"]}, 1.0),
+        (make_config("flight", planner={"downwash": 2.0}), NAMED, 2.0),
+    ],
+)
+def test_the_downwash_of_a_world_is_that_of_the_named_vehicle(preset, world, downwash):
+    assert make_config(preset, world).planner.downwash == downwash
+
+
 def test_unknown_names_are_refused():
     with pytest.raises(ValueError, match="Did you mean 'crazyflie21'"):
         make_config("flight", world={"quadrotor": "crazyflie2"})

@@ -210,12 +210,15 @@ class Planner:
             ("announced", (), np.dtype(bool)),
             ("shape", (3,), _TYPES[0]),
             ("size", (), _TYPES[0]),
+            ("penalty", (), _TYPES[0]),
         ):
             given = getattr(problems, name)
             about[name] = None if given is None else _array(name, given, (count, n_others, *more), dtype)
             shaped = getattr(getattr(self.solver, "problem", None), "shaped", True)
-            if given is not None and name in ("shape", "size") and not shaped:
+            if given is not None and name in ("shape", "size", "penalty") and not shaped:
                 raise ValueError(f"{name}: this planner avoids spheres only; create it with obstacles or downwash.")
+        if about["penalty"] is not None and (about["penalty"] <= 0).any():
+            raise ValueError("penalty: factors of the weight of violations must be positive.")
         about |= self._checked_of_robots(problems, x)
         return Problems(x, goal, others, **about), Plans(
             # The last plan is a guess, so that numbers which are not finite only cost a retry

@@ -28,6 +28,7 @@ class PlanCost:
         :return: the costs, (B,)
         """
         problem, (count, m) = self.problem, problems.others.shape[:2]
+        problems = problems.penalised(problem.config.separation)
         if self._function is None:
             self._function = _objective(problem)
         nothing, stages = np.zeros((count, 0)), problem.config.horizon

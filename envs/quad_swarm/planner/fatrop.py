@@ -53,6 +53,7 @@ class FatropSolver:
                 "fatrop.max_iter": self.max_iterations,
             }
             self._solver = ca.nlpsol("planner", "fatrop", self._program.nlp, self._program.structure | options)
+        problems = problems.penalised(self.problem.config.separation)
         program, solver, nx, nu = self._program, self._solver, self.problem.nx, self.problem.nu
         count, horizon = u_guess.shape[:2]
         x = np.zeros((count, horizon + 1, N_STATES))

@@ -59,6 +59,8 @@ class PlannerConfig:
         robot's last plan; None for all
     :param max_obstacles: maximum number of obstacles to consider. Places are common: a robot considers those of all
         others and obstacles together that its last plan comes closest to
+    :param obstacle_penalty: how many times as much violations of the distance to obstacles cost as those of the
+        distance to robots, see `Problems.penalty` (-). An obstacle is where it is believed to be, and does not give way
     :param downwash: height over width of the ellipsoid around another robot that robots keep out of, because of the air
         that rotors blow down (-); 1 for spheres
     :param problem: a name of `PROBLEMS`: the dynamics that are planned, and flown with ``plant="model"``, and the cost;
@@ -94,6 +96,7 @@ class PlannerConfig:
     violation_weight: PositiveFloat = 1e4
     max_neighbours: PositiveInt | None = None
     max_obstacles: PositiveInt = 12
+    obstacle_penalty: Annotated[float, Field(ge=1, le=1e3)] = 1.0
     downwash: Annotated[float, Field(ge=1, le=20)] = 1.0
     cruise_distance: PositiveLength | None = None
     commitment: Annotated[float, Field(ge=0, le=1e4)] = 0.0
@@ -157,6 +160,8 @@ class Problems(NamedTuple):
         None for ellipsoids with the planner's ``downwash``
     :param size: how much larger than a robot each body is, (B, m) (m), added to the separation; smaller ones are
         negative. None for 0
+    :param penalty: factors of ``violation_weight`` for violations of the distance to each body, (B, m), see
+        `penalised`; None for 1
     :param reference: positions that each robot keeps to at stages 1..N, (B, N, 3), world frame (m); None for none
     :param reference_weight: weights of the squared distances to them, (B, N) (1/m^2)
     :param disturbance: constant accelerations that act on the robots beside what the model knows, (B, 3), world frame
@@ -174,6 +179,7 @@ class Problems(NamedTuple):
     announced: np.ndarray | None = None
     shape: np.ndarray | None = None
     size: np.ndarray | None = None
+    penalty: np.ndarray | None = None
     reference: np.ndarray | None = None
     reference_weight: np.ndarray | None = None
     disturbance: np.ndarray | None = None
@@ -203,9 +209,28 @@ class Problems(NamedTuple):
             found &= (self.shape == [1.0, 1.0, 1.0 / downwash]).all(axis=-1)
         return found if self.size is None else found & (self.size == 0)
 
+    def penalised(self, separation: float) -> Problems:
+        """Return the problems with penalties as a part of shapes, sizes and clearances, for solvers that weigh all
+        violations alike: distances to a body beyond the one to keep, and with them its violations and its repulsion,
+        grow with the root of its penalty.
+
+        :param separation: distance that the planner keeps (m)
+        """
+        if self.penalty is None:
+            return self
+        scale = np.sqrt(self.penalty)
+        shape = np.ones((*scale.shape, 3)) if self.shape is None else self.shape
+        size = np.zeros(scale.shape) if self.size is None else self.size
+        return self._replace(
+            clearance=None if self.clearance is None else scale[..., None] * self.clearance,
+            shape=scale[..., None] * shape,
+            size=scale * (separation + size) - separation,
+            penalty=None,
+        )
+
     def chosen(self, bodies: np.ndarray) -> Problems:
         """Return the problems with some of the bodies only, whose indices are (B, k)."""
-        rows, about = np.arange(len(bodies))[:, None], ("others", "clearance", "announced", "shape", "size")
+        rows, about = np.arange(len(bodies))[:, None], ("others", "clearance", "announced", "shape", "size", "penalty")
         given = {name: array for name in about if (array := getattr(self, name)) is not None}
         return self._replace(**{name: array[rows, bodies] for name, array in given.items()})
 

@@ -201,9 +201,14 @@ def _among(
     announced = problems.announced
     if announced is not None:
         announced = np.concatenate([announced, np.zeros((count, k), bool)], axis=1)
+    penalty = None
+    if planner.obstacle_penalty != 1:
+        penalty = np.ones((count, m + k))
+        penalty[:, m:] = planner.obstacle_penalty
     return problems._replace(
         others=np.concatenate([problems.others, expected], axis=1),
         announced=announced,
         shape=shape.reshape(count, m + k, 3),
         size=size.reshape(count, m + k),
+        penalty=penalty,
     )

@@ -22,7 +22,7 @@ from quad_swarm.planner.problem import check_vehicle, make_problem, problem_clas
 from quad_swarm.plants.base import MODEL, Plant, make_plant, parse_plant
 from quad_swarm.quadrotor import VELOCITY, MixedModel, QuadrotorParams, VehicleModel
 from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, angles, checked, points, replaced, vectors
-from quad_swarm.vehicles import load_vehicle
+from quad_swarm.vehicles import DOWNWASH, load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
 from quad_swarm.world.doubts import (
     doubts,
@@ -453,11 +453,13 @@ class SwarmConfig:
         if self.vehicles:  # what a robot needs beyond contact, it needs from all others
             beyond = self.per_robot(lambda kind: least(kind) - 2 * kind.radius)
             needed = self.radii[:, None] + self.radii + np.maximum(beyond[:, None], beyond)
-        i, j, distance = _closest(places, needed)
+        downwash = self.planner.downwash
+        i, j, distance = _closest(places * (1, 1, 1 / downwash), needed)
         needed = np.broadcast_to(needed, (len(places), len(places)))[i, j]
         if distance < needed:
+            metric = "" if downwash == 1 else f" (vertical distances count 1 / {downwash:g}, planner.downwash)"
             raise ValueError(
-                f"{name}[{i}] and {name}[{j}] are {distance:.3g} m apart, where {why}: place them at least "
+                f"{name}[{i}] and {name}[{j}] are {distance:.3g} m apart{metric}, where {why}: place them at least "
                 f"{needed + self.collision_tolerance:.3g} m apart"
             )
 
@@ -570,11 +572,11 @@ PRESETS: dict[str, SwarmConfig] = {
         space=_SMALL_ROOM,
     ),
     "flight": _FLIGHT,
-    # Version 2 of `flight`: answers count when they come, and robots hold against wind and payloads and keep to the
-    # plans that they sent. See docs/flight.md for what each of these is worth.
+    # Version 2 of `flight`: answers count when they come, and robots hold against wind and payloads, keep to the plans
+    # that they sent, and give way to obstacles before others. See docs/flight.md for what each of these is worth.
     "flight-v2": replace(
         _FLIGHT,
-        planner=replace(_FLIGHT.planner, disturbance_time=1.0, commitment=1.0),
+        planner=replace(_FLIGHT.planner, disturbance_time=1.0, commitment=1.0, obstacle_penalty=30.0),
         radio=Radio(loss=0.1, round_trip=0, jitter=1),
     ),
     # The same team without motion capture and in more wind: errors two to four times as large, interrupted links, and
@@ -598,8 +600,9 @@ def make_config(
     What depends on other fields follows them, unless it is given: the planner's separation keeps the preset's margin
     beyond twice the radius; the spacing of starts and goals keeps the preset's margin beyond the separation if robots
     would start closer than that; and the workspace grows with a room that exceeds it. With ``vehicles``, the largest
-    robot counts. ``quadrotor``, also that of a vehicle, may be a name of `VEHICLES` or the path of a vehicle file. With
-    another ``plant`` than the model, or dynamics of your own (``planner.problem``), ``mismatch`` defaults to 0.
+    robot counts. ``quadrotor``, also that of a vehicle, may be a name of `VEHICLES` or the path of a vehicle file. The
+    planner's downwash follows the name (`quad_swarm.vehicles.DOWNWASH`; of several vehicles, the largest). With another
+    ``plant`` than the model, or dynamics of your own (``planner.problem``), ``mismatch`` defaults to 0.
 
     :param preset: a name of `PRESETS`, or a world
     :param world: fields of `SwarmConfig` to replace, nested ones as mappings
@@ -610,6 +613,7 @@ def make_config(
         raise unknown_name("preset", preset, PRESETS)
     changes = _joined(world or {}, {name: value for name, value in overrides.items() if value is not None})
     base = preset if isinstance(preset, SwarmConfig) else PRESETS[preset]
+    changes = _with_downwash(base, changes)
     if isinstance(vehicle := changes.get("quadrotor"), (str, os.PathLike)):
         changes = {**changes, "quadrotor": load_vehicle(vehicle)}
     if "vehicles" in changes:
@@ -690,6 +694,17 @@ def _with_followers(base: SwarmConfig, changes: dict[str, Any]) -> dict[str, Any
         given = {**_workspace(base, space), **given}
     followers = {"planner": given, "space": room}
     return {**changes, **{name: value for name, value in followers.items() if value != {}}}
+
+
+def _with_downwash(base: SwarmConfig, changes: dict[str, Any]) -> dict[str, Any]:
+    """Add the downwash that belongs to the names of vehicles, unless one is given, see `make_config`."""
+    several, planner = changes.get("vehicles"), changes.get("planner", {})
+    kinds = [one for one in several if isinstance(one, Mapping)] if isinstance(several, (list, tuple)) else []
+    names = [one.get("quadrotor") for one in (changes, *kinds)]
+    known = [DOWNWASH[name] for name in names if isinstance(name, str) and name in DOWNWASH]
+    if not known or not isinstance(planner, Mapping) or "downwash" in planner or base.planner.downwash != 1:
+        return changes
+    return {**changes, "planner": {**planner, "downwash": max(known)}}
 
 
 def _larger(vehicles: Sequence[Any], radius: float) -> float:

@@ -10,10 +10,11 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from quad_swarm.errors import shown, unknown_name
 from quad_swarm.validation import LARGEST_LENGTH, Count, Length, PositiveLength, Range, checked
@@ -42,7 +43,8 @@ class ScenarioSpace:
 
     :param half_width: starts and goals of `random` and `random_swap` lie in [-half_width, half_width]^2 (m)
     :param heights: minimum and maximum height of starts and goals (m)
-    :param spacing: minimum distance between two starts, and between two goals (m)
+    :param spacing: minimum distance between two starts, and between two goals (m), in the metric of ``downwash``
+    :param downwash: how much less vertical distances count there (-); None for the planner's
     :param circle_radius: minimum and maximum radius of the circle of `symmetric_swap` (m)
     :param circle_jitter: maximum displacement of starts and goals of `symmetric_swap` along each axis (m)
     :param sector_radius: minimum and maximum distance of the starts of `asymmetric_swap` from the centre (m)
@@ -75,6 +77,12 @@ class ScenarioSpace:
     traffic_speed: Range = (0.5, 1.0)
     waypoints: tuple[Count, Count] = (1, 2)
     goal_speed: Range = (0.2, 0.4)
+    downwash: Annotated[float, Field(ge=1, le=20)] | None = None
+
+    @property
+    def factors(self) -> np.ndarray:
+        """Factors of differences along x, y and z in distances that ``spacing`` limits, (3,)."""
+        return np.array([1.0, 1.0, 1.0 if self.downwash is None else 1 / self.downwash])
 
     def __post_init__(self) -> None:
         for name in ("pillars", "traffic", "waypoints"):
@@ -131,32 +139,32 @@ class DoesNotFit(ValueError):
     """Raised if the robots do not fit into the room of a scenario."""
 
 
-def _place(n_points: int, draw: Callable[[int], np.ndarray], spacing: float) -> np.ndarray:
-    """Draw points ``draw(0) ... draw(n_points - 1)``, (n, 3), until all are at least ``spacing`` apart.
+def _place(n_points: int, draw: Callable[[int], np.ndarray], space: ScenarioSpace) -> np.ndarray:
+    """Draw points ``draw(0) ... draw(n_points - 1)``, (n, 3), until all are at least ``space.spacing`` apart.
 
     :raises DoesNotFit: if a limited number of draws finds no such set
     """
-    points = np.empty((n_points, 3))
+    points, factors = np.empty((n_points, 3)), space.factors
     placed = 0
     for k in range(_MAX_DRAWS):
         if k % (_DRAWS_PER_POINT * n_points) == 0:
             placed = 0
         point = draw(placed)
-        if placed == 0 or ((points[:placed] - point) ** 2).sum(axis=1).min() >= spacing**2:
+        if placed == 0 or ((factors * (points[:placed] - point)) ** 2).sum(axis=1).min() >= space.spacing**2:
             points[placed] = point
             placed += 1
             if placed == n_points:
                 return points
     raise DoesNotFit(
-        f"{n_points} robots at least {spacing} m apart do not fit into the room of this scenario: choose fewer robots "
-        "or a larger room."
+        f"{n_points} robots at least {space.spacing} m apart do not fit into the room of this scenario: choose fewer "
+        "robots or a larger room."
     )
 
 
 def _in_box(n_robots: int, space: ScenarioSpace, rng: Rng) -> np.ndarray:
     low = (-space.half_width, -space.half_width, space.heights[0])
     high = (space.half_width, space.half_width, space.heights[1])
-    return _place(n_robots, lambda _: rng.uniform(low, high), space.spacing)
+    return _place(n_robots, lambda _: rng.uniform(low, high), space)
 
 
 def random(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
@@ -187,7 +195,7 @@ def asymmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.n
         radius = rng.uniform(*space.sector_radius)
         return np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(*space.heights)])
 
-    starts = _place(n_robots, draw, space.spacing)
+    starts = _place(n_robots, draw, space)
     return starts, starts[(np.arange(n_robots) + n_robots // 2) % n_robots]
 
 
@@ -207,7 +215,7 @@ def symmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.nd
 
         return draw
 
-    return _place(n_robots, draw_around(0.0), space.spacing), _place(n_robots, draw_around(np.pi), space.spacing)
+    return _place(n_robots, draw_around(0.0), space), _place(n_robots, draw_around(np.pi), space)
 
 
 def forest(n_robots: int, space: ScenarioSpace, rng: Rng) -> Scene:
@@ -242,13 +250,14 @@ def doorway(n_robots: int, space: ScenarioSpace, rng: Rng) -> Scene:
             raise DoesNotFit(f"There is no room beside the doorway in space.half_width={space.half_width}.")
         return point * (-1 if i < left else 1, 1, 1)
 
-    starts = _place(n_robots, draw, space.spacing)
+    starts = _place(n_robots, draw, space)
     right = n_robots - left
     order = np.arange(n_robots)
     order[:right], order[left:] = np.arange(left, n_robots), np.arange(right)
     goals = starts[order]
     goals[right:left] *= (-1, 1, 1)  # an odd robot has no partner
-    if ((np.delete(goals, right, axis=0) - goals[right]) ** 2).sum(axis=1).min() < space.spacing**2 and right < left:
+    between = space.factors * (np.delete(goals, right, axis=0) - goals[right])
+    if (between**2).sum(axis=1).min() < space.spacing**2 and right < left:
         raise DoesNotFit("The goal of the odd robot is taken.")
     return Scene(starts, goals, pillars)
 
@@ -283,7 +292,7 @@ def moving_goals(n_robots: int, space: ScenarioSpace, rng: Rng) -> Scene:
     low = np.array([-space.half_width, -space.half_width, space.heights[0]])
     high = np.array([space.half_width, space.half_width, space.heights[1]])
     (high if way > 0 else low)[axis] = 0.0
-    goals = _place(n_robots, lambda _: rng.uniform(low, high), space.spacing)
+    goals = _place(n_robots, lambda _: rng.uniform(low, high), space)
     velocities = np.zeros((n_robots, 3))
     velocities[:, axis] = way * rng.uniform(*space.goal_speed)
     return Scene(starts, goals, velocities=velocities)
@@ -448,6 +457,8 @@ class ScenarioSampler:
             raise ValueError(f"n_robots={n_robots}: a swarm needs at least 2 robots.")
         self.name = name
         self.n_robots = n_robots
+        if space.downwash is None and world is not None:
+            space = replace(space, downwash=world.planner.downwash)
         self.space = space
         self.world = world
         self.level = 0

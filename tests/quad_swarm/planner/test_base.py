@@ -207,6 +207,29 @@ def test_keeps_clear_of_bodies_of_any_shape_and_size(shape, solver):
 
 
 @pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_a_robot_gives_way_to_what_has_the_larger_penalty(solver):
+    """It hovers between two walls that leave too little room: violations are shared by their weights."""
+    config = PlannerConfig(separation=0.8, repulsion_weight=0.0, input_weight=1e-4, horizon=20)
+    planner = make_planner(config, QUADROTOR, 2, solver, n_obstacles=1)
+    x = np.zeros((1, 9))
+    x[0, 2] = 1.0
+    others = np.repeat(np.array([[[0.7, 0.0, 1.0], [-0.7, 0.0, 1.0]]])[:, :, None], config.horizon, axis=2)
+    walls = np.tile([1.0, 0.0, 0.0], (1, 2, 1))
+    problems = Problems(x, x[:, :3], others, shape=walls, size=np.zeros((1, 2)), penalty=np.array([[9.0, 1.0]]))
+    plans = hover(problems, config)
+    for _ in range(60):
+        plans = planner.plan(problems, plans)
+        problems = problems._replace(x=plans.x[:, 1])
+    assert problems.x[0, 0] == pytest.approx(-0.08, abs=0.01)  # 9 (0.1 + x) = 0.1 - x
+    alike = problems._replace(x=x, penalty=np.ones((1, 2)))
+    assert_same(
+        planner.plan(alike, hover(alike, config)), planner.plan(alike._replace(penalty=None), hover(alike, config))
+    )
+    with pytest.raises(ValueError, match="penalty: factors of the weight of violations must be positive"):
+        planner.plan(problems._replace(penalty=np.array([[0.0, 1.0]])), plans)
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
 def test_without_shapes_others_have_the_planners_downwash(solver):
     config = PlannerConfig(downwash=2.0)
     problems = crossing(3, config)
@@ -309,6 +332,9 @@ def test_a_large_body_far_away_takes_the_place_of_a_small_one_nearby(solver):
     limited = make_planner(config, QUADROTOR, 3, solver, n_obstacles=2)
     nearest = make_planner(config, QUADROTOR, 2, solver, n_obstacles=1)
     assert_same(limited.plan(problems, last), nearest.plan(problems.chosen(np.array([[2, 3]])), last))
+    penalty = np.array([[1.0, 1.0, 3.0, 1.0]])
+    limited = limited.plan(problems._replace(penalty=penalty), last)
+    assert_same(limited, nearest.plan(problems._replace(penalty=penalty).chosen(np.array([[2, 3]])), last))
 
 
 @pytest.mark.parametrize("solver", ["rti", "fatrop"])

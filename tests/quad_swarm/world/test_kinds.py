@@ -264,7 +264,7 @@ def test_each_robot_flies_its_own_vehicle_and_keeps_its_own_limits():
 
 
 def test_what_robots_perceive_counts_from_surface_to_surface():
-    config = make_config("paper", UNLIKE)
+    config = make_config("paper", UNLIKE, planner={"downwash": 1.0})
     task, _ = flown(config, 2, 6)
     view = View(task.swarm)
     apart = np.take_along_axis(distances(task.swarm), np.array([[[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]]), axis=2)

@@ -29,6 +29,19 @@ def test_beliefs_begin_without_plans():
     assert beliefs.misfit == pytest.approx(0.5 * CONFIG.planner.separation)
 
 
+def test_violations_of_the_distance_to_obstacles_may_cost_more():
+    pillar = {"position": (0, 0, 0), "radius": 0.2}
+    config = make_config(
+        "flight", {"planner": {"obstacle_penalty": 4.0}, "obstacles": {"listed": [pillar]}}, n_robots=3
+    )
+    swarm, seen = Swarm(config), []
+    swarm.reset(0, [[-2, 0, 1], [2, 0, 1], [0, 2, 1]], [[2, 0, 1], [-2, 0, 1], [0, -2, 1]])
+    plan = swarm.planner.plan
+    swarm.planner.plan = lambda problems, last: seen.append(problems) or plan(problems, last)
+    swarm.step(np.zeros((1, 3, 2), bool))
+    assert seen[0].penalty.tolist() == [[1.0, 1.0, 4.0]] * 3
+
+
 @pytest.mark.parametrize("late", [None, 0.5])
 def test_problems_start_when_inputs_take_effect(late):
     swarm = Swarm(CONFIG)

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from quad_swarm import QuadSwarmEnv, QuadSwarmParallelEnv, QuadSwarmVectorEnv
 from quad_swarm.evaluation.flight import Condition
-from quad_swarm.world.presets import PRESETS, make_config
+from quad_swarm.world.presets import PRESETS, for_scenario, make_config
 from quad_swarm.world.scenarios import (
+    MOST_OBSTACLES,
     SCENARIOS,
     DoesNotFit,
     ScenarioSampler,
@@ -307,3 +308,24 @@ def test_a_registered_scenario_that_seldom_fails_is_drawn_again(monkeypatch):
     config = make_config("paper")
     sampler = ScenarioSampler("seldom", 4, config.space, config)
     assert min(spacing(sampler.sample(np.random.default_rng(seed))[1]) for seed in range(100)) >= SPACE.spacing
+
+
+@pytest.mark.parametrize("name", [*without_obstacles(), *MOST_OBSTACLES])
+def test_starts_and_goals_are_apart_in_the_metric_of_the_downwash(name):
+    """Robots would start in each other's downwash otherwise, which counts as contact."""
+    config = make_config("flight", planner={"downwash": 3.0, "separation": 0.8}, n_robots=6)
+    sampler = ScenarioSampler(name, 6, config.space, for_scenario(config, name))
+    for seed in range(20):
+        _, starts, goals, *_ = sampler.sample(np.random.default_rng(seed))
+        for places in (starts, goals):
+            between = (places[:, None] - places) * (1, 1, 1 / 3)
+            assert np.linalg.norm(between[np.triu_indices(6, 1)], axis=-1).min() >= config.space.spacing
+
+
+def test_given_starts_in_the_downwash_of_others_are_refused():
+    env = QuadSwarmEnv(preset="flight", n_robots=2, world={"planner": {"downwash": 3.0}})
+    starts, goals = [[0.0, 0.0, 0.8], [0.0, 0.1, 2.2]], [[2.0, 0.0, 1.0], [-2.0, 0.0, 1.0]]
+    with pytest.raises(
+        ValueError, match=r"starts\[0\] and starts\[1\] are 0.477 m apart \(vertical distances count 1 / 3"
+    ):
+        env.reset(seed=0, options={"starts": starts, "goals": goals})

@@ -112,6 +112,7 @@ class RtiSolver:
 
         :raises ValueError: if an array has another shape than the problem's
         """
+        problems = problems.penalised(self.problem.config.separation)
         given = {
             name: None if (array := getattr(problems, name)) is None else np.asarray(array, float) for name in _GIVEN
         }
