@@ -63,6 +63,8 @@ def find_environment(env_id: str | None) -> str:
             "parallel_env, as PettingZoo's modules have. Is its package installed or in this folder?"
             f"{did_you_mean(package, modules_beside(package))}"
         )
+    if env_id.isidentifier() and (packaged := pettingzoo_ids.packaged(env_id)):
+        raise InvalidArgumentError(f"Unknown environment '{env_id}'. Did you mean {' or '.join(map(repr, packaged))}?")
     if difflib.get_close_matches(env_id, ids, n=1):
         raise InvalidArgumentError(suggest("environment", env_id, ids))
     nearest = ", ".join(difflib.get_close_matches(env_id, ids, n=3, cutoff=0))

@@ -17,7 +17,7 @@ from stable_baselines3.common.save_util import open_path
 
 from sb3_maddpg.errors import InvalidFileError, TeamError
 from sb3_maddpg.offers import OfferError
-from sb3_maddpg.utils import shown, told
+from sb3_maddpg.utils import did_you_mean, shown, told
 
 # What files may hold at most. Their authors are unknown, so nothing is read or built that needs much more memory than a
 # file of this library does.
@@ -70,13 +70,20 @@ def opened(path: Any, kind: str = "model", suffix: str | None = None) -> Iterato
     :param suffix: suffix that the path may lack, as in SB3
     :return: the open file
     :raises InvalidFileError: if it is neither, or the content raises an error of another library, see ``as_damage``
+    :raises FileNotFoundError: if there is no such file; the message names a similar one in its folder
     :raises OSError: if it cannot be read
     """
     check_path(path)
     with as_damage(path, kind), ExitStack() as at_end:
         if isinstance(path, (str, os.PathLike)):
             lacks = suffix if Path(path).suffix != f".{suffix}" else None
-            yield at_end.enter_context(open_path(Path(path), "r", suffix=lacks))
+            try:
+                file = open_path(Path(path), "r", suffix=lacks)
+            except FileNotFoundError as error:
+                beside = [one.name for one in Path(path).parent.glob(f"*.{suffix or '*'}")]
+                text = f"There is no such {kind} file from {os.getcwd()}.{did_you_mean(Path(path).name, beside, 0.5)}"
+                raise FileNotFoundError(error.errno, text, error.filename) from None
+            yield at_end.enter_context(file)
         else:
             path.seek(0)
             at_end.callback(path.seek, 0)

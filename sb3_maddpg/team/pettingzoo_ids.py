@@ -1,8 +1,11 @@
 """Gymnasium ids for PettingZoo modules, which have a function ``parallel_env``."""
 
+import importlib.metadata
+import importlib.util
 import inspect
 import pkgutil
 import re
+from contextlib import suppress
 
 import gymnasium
 
@@ -48,6 +51,27 @@ def siblings(env_id: str) -> list[str]:
         return []
     paths = getattr(find_module(package), "__path__", [])
     return [f"{package}/{found.name}" for found in pkgutil.iter_modules(paths) if re.search(r"_v\d+$", found.name)]
+
+
+def packaged(module: str) -> list[str]:
+    """
+    :param module: name of a module without its package, such as "simple_spread_v3"
+    :return: ids of the modules of this name in PettingZoo and the installed packages that require it
+    """
+    packages = set()
+    for found in importlib.metadata.distributions():
+        if any(re.match(r"pettingzoo\b", needed, re.IGNORECASE) for needed in found.requires or ()):
+            packages |= {path.parts[0] for path in found.files or () if path.name == "__init__.py"}
+    with suppress(ImportError):
+        import pettingzoo
+
+        packages |= {f"pettingzoo.{one.name}" for one in pkgutil.iter_modules(pettingzoo.__path__) if one.ispkg}
+    ids = []
+    for package in sorted(packages):
+        with suppress(ImportError, ValueError, AttributeError):  # packages may be broken, or need others
+            if importlib.util.find_spec(f"{package}.{module}") is not None:
+                ids.append(f"{package.replace('.', '/')}/{module}")
+    return ids
 
 
 def arguments(entry: str) -> set[str] | None:

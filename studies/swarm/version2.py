@@ -7,7 +7,10 @@ nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios 
 ``crowd`` (full communication of sixteen) in all scenarios; set 702 ``identified``, RotorPy's Hummingbird with its own
 model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five times as often;
 set 704 the same of four, twelve and sixteen (``four_again``, ``twelve_again``, ``crowd_again``); set 705
-``one_small`` and ``one_large``, one model of version 1 at one threshold, with four to sixteen robots. JSON: one row per
+``one_small`` and ``one_large``, one model of version 1 at one threshold, with four to sixteen robots; set 706
+``among_eight``, ``among_four``, ``among_twelve`` and ``among_sixteen``, full communication and that model among
+obstacles, after these had been given a larger penalty than robots. All earlier parts fly with equal penalties, as they
+did. JSON: one row per
 policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run that is ended
 keeps what it has.
 """
@@ -33,7 +36,7 @@ from studies.swarm.experiment import condition
 from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
-SEALED, LATER, LAST, MORE, AGAIN, ONE = 700, 701, 702, 703, 704, 705
+SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG = range(700, 707)
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -41,9 +44,12 @@ MODELS = (LEARNED, f"{LEARNED}@0.05")
 # Of the five models, the one that sent least with eight and sixteen robots on validation episodes of version 2, none of
 # which collided; the threshold too
 ONE_MODEL = f"{models('flight')[4]}@0.5"
+# The same model as a package, at its own threshold
+SHIPPED = str(pretrained_folder("quad-swarm-flight-v2") / "model.zip")
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
 CHECKED: dict[str, Any] = {"radio": {"jitter": 0}, "planner": {"commitment": 0.0}}
+ALIKE = {"planner": {"obstacle_penalty": 1.0}}  # of sets up to 705
 
 
 class Part(NamedTuple):
@@ -94,6 +100,10 @@ PARTS = {
     "crowd_again": Part(("full",), EVERYWHERE, (16,), 10000, AGAIN),
     "one_small": Part((ONE_MODEL,), tuple(without_obstacles()), (4, 8), 4000, ONE),
     "one_large": Part((ONE_MODEL,), tuple(without_obstacles()), (12, 16), 2000, ONE),
+    "among_eight": Part(("full", SHIPPED), tuple(MOST_OBSTACLES), (8,), 4000, AMONG),
+    "among_four": Part(("full", SHIPPED), tuple(MOST_OBSTACLES), (4,), 4000, AMONG),
+    "among_twelve": Part(("full", SHIPPED), tuple(MOST_OBSTACLES), (12,), 2000, AMONG),
+    "among_sixteen": Part(("full", SHIPPED), tuple(MOST_OBSTACLES), (16,), 2000, AMONG),
 }
 
 
@@ -105,6 +115,8 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
     count = episodes or part.episodes
     for n in part.n_robots:
         config = make_config(world("flight-v2", n), plant=part.plant, quadrotor=part.vehicle)
+        if part.set < AMONG:
+            config = make_config(config, ALIKE)
         for scenario in part.scenarios:
             flown: dict[str, Rows] = {}
             conditions = [condition(policy, scenario, config) for policy in part.policies if policy != DELAY_CHECK]
@@ -122,7 +134,7 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
 
 
 def _name(policy: str) -> str:
-    return policy.replace(LEARNED, "pretrained:quad-swarm-flight")
+    return policy.replace(LEARNED, "pretrained:quad-swarm-flight").replace(SHIPPED, "pretrained:quad-swarm-flight-v2")
 
 
 OUTCOME = ("collided", "95 % interval", "1 % closer than", "plans", "arrived", "steps")

@@ -28,8 +28,16 @@ CALM = {
 
 
 def test_sets_of_episodes_are_apart():
-    later = (version2.SEALED, version2.LATER, version2.LAST, version2.MORE, version2.AGAIN, version2.ONE)
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 13
+    later = (
+        version2.SEALED,
+        version2.LATER,
+        version2.LAST,
+        version2.MORE,
+        version2.AGAIN,
+        version2.ONE,
+        version2.AMONG,
+    )
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 14
 
 
 def test_the_table_at_a_glance_says_what_it_costs():

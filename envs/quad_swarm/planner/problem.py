@@ -27,6 +27,12 @@ def _not_tiny(rate: float) -> float:
     return rate
 
 
+def _below_a_right_angle(tilt: float) -> float:
+    if tilt >= math.pi / 2:
+        raise PydanticCustomError("tilt", "it must be less than 1.57 rad; 12 degrees are 0.21 rad")
+    return tilt
+
+
 @checked
 @dataclass(frozen=True)
 class PlannerConfig:
@@ -80,7 +86,7 @@ class PlannerConfig:
     horizon: Annotated[int, Field(ge=2, le=1000)] = 10
     dt: PositiveFloat = 0.1
     separation: PositiveLength = 0.6
-    max_tilt: Annotated[float, Field(ge=_TINIEST, lt=math.pi / 2)] = math.radians(12.0)
+    max_tilt: Annotated[float, Field(ge=_TINIEST), AfterValidator(_below_a_right_angle)] = math.radians(12.0)
     max_climb_rate: _Rate = 1.0
     max_yaw_rate: Annotated[float, Field(ge=0, le=1e4), AfterValidator(_not_tiny)] = 0.0
     max_speed: PositiveFloat = 4.0

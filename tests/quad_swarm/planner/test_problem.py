@@ -114,7 +114,7 @@ def test_what_leaves_the_box_is_a_violation_by_so_much(column, value, violation)
     [
         ({"horizon": 1}, "horizon=1: it must be greater than or equal to 2"),
         ({"dt": 0.0}, r"dt=0\.0"),
-        ({"max_tilt": 1.6}, r"max_tilt=1\.6: it must be less than 1\.57"),
+        ({"max_tilt": 1.6}, r"max_tilt=1\.6: it must be less than 1\.57 rad"),
         ({"max_descent_rate": 0.0}, r"max_descent_rate=0\.0: it must be greater than or equal to 0\.000001"),
         ({"max_descent_speed": -1.0}, r"max_descent_speed=-1\.0: it must be greater than 0"),
         ({"input_weight": float("nan")}, "input_weight=nan: it must be a finite number"),

@@ -70,6 +70,14 @@ def test_what_is_no_zip_file_is_refused(content):
         Archive(io.BytesIO(content), "file")
 
 
+def test_a_missing_file_is_told_with_a_similar_one(tmp_path):
+    (tmp_path / "best_model.zip").touch()
+    with pytest.raises(FileNotFoundError, match=r"no such model file from .* mean 'best_model.zip'\?: '.*bset_model"):
+        MADDPG.load(tmp_path / "bset_model")
+    with pytest.raises(FileNotFoundError, match=r"no such model file from /[^?]*\.: 'elsewhere/a.zip'$"):
+        MADDPG.load("elsewhere/a.zip")
+
+
 def test_two_members_of_one_name_are_refused():
     file = zipped({"a": b"1"})
     with warnings.catch_warnings(), zipfile.ZipFile(file, "a") as new:

@@ -4,6 +4,8 @@ import gymnasium
 import pytest
 from gymnasium import spaces
 
+from sb3_maddpg.cli.environments import find_environment
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.team import pettingzoo as parallel
 from sb3_maddpg.team import pettingzoo_ids
 
@@ -56,3 +58,10 @@ def test_a_file_in_the_present_folder_is_an_environment_id(tmp_path, monkeypatch
     monkeypatch.syspath_prepend(tmp_path)
     assert pettingzoo_ids.register("flat_team")
     assert gymnasium.make("flat_team").observation_space.names == ("agent_0", "agent_1", "agent_2")
+
+
+def test_packages_with_a_module_are_found():
+    assert pettingzoo_ids.packaged("simple_spread_v3") == ["mpe2/simple_spread_v3"]
+    assert pettingzoo_ids.packaged("no_module_v0") == []
+    with pytest.raises(InvalidArgumentError, match=r"'simple_tag_v3'\. Did you mean 'mpe2/simple_tag_v3'\?"):
+        find_environment("simple_tag_v3")
