@@ -23,6 +23,7 @@ from quad_swarm.geometry import length
 from quad_swarm.world.beliefs import other_indices
 
 _SMALLEST_SHARE = 1e-3  # up to which axes are linear
+_FILM, _SMOOTHING = (1280, 960), 2  # pixels of a GIF, and how many times as large it is drawn
 _SHORTEST_FRAME = 0.02  # players slow down shorter frames of a GIF (s)
 
 
@@ -190,7 +191,8 @@ def animate(condition: Condition, flight: Flight, path: Path) -> None:
 
     Steps that are shorter than `_SHORTEST_FRAME` share an image.
     """
-    renderer = Renderer(flight.config)
+    size = (_FILM[0] * _SMOOTHING, _FILM[1] * _SMOOTHING)
+    renderer = Renderer(flight.config, size, scale=size[0] // 640)
     steps = len(flight.requests) if flight.arrival is None else min(flight.arrival + 9, len(flight.requests))
     dt = flight.config.planner.dt
     stride = math.ceil(_SHORTEST_FRAME / dt - 1e-9)
@@ -206,7 +208,8 @@ def animate(condition: Condition, flight: Flight, path: Path) -> None:
         goal = flight.goal if flight.goals is None else flight.goals[k + 1]
         step = (flight.state[k + 1], goal, flight.plans[k + 1], flight.requests[k])
         picture = renderer.draw(*step, lines, flight.obstacles_at(k + 1))
-        frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
+        smooth = Image.fromarray(picture).reduce(_SMOOTHING)
+        frames.append(smooth.quantize(colors=64, dither=Image.Dither.NONE))
     durations = (10 * np.diff(times)).tolist()
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 

@@ -33,14 +33,16 @@ class Renderer:
 
     :param config: the world
     :param size: width and height of the image (pixels)
+    :param scale: how many times as wide lines, and as high texts, are as in an image of 640 by 480 pixels
     """
 
-    def __init__(self, config: SwarmConfig, size: tuple[int, int] = (640, 480)):
+    def __init__(self, config: SwarmConfig, size: tuple[int, int] = (640, 480), scale: int = 1):
         pygame.font.init()
         self.config = config
         self.size = size
+        self.scale = scale
         self._surface = pygame.Surface(size)
-        self._font = pygame.font.Font(None, 22)
+        self._font = pygame.font.Font(None, 22 * scale)
         self._others = other_indices(config.n_robots)
         self._trail: deque[np.ndarray] = deque(maxlen=_TRAIL_STEPS)
         self._camera: _Camera | None = None
@@ -100,7 +102,8 @@ class Renderer:
             if k < len(obstacles):
                 self._draw_obstacle(obstacles[order[k]])
         for row, line in enumerate(lines):
-            self._surface.blit(self._font.render(line, True, _INK), (10, 8 + 18 * row))
+            place = (10 * self.scale, (8 + 18 * row) * self.scale)
+            self._surface.blit(self._font.render(line, True, _INK), place)
         pixels = np.frombuffer(pygame.image.tobytes(self._surface, "RGB"), np.uint8)
         return pixels.reshape(self.size[1], self.size[0], 3).copy()
 
@@ -140,8 +143,9 @@ class Renderer:
             along = (end - start) / length
             across = np.array([-along[1], along[0]])
             # Beside the line between the two, so that mutual requests do not overlap
+            along, across = along * self.scale, across * self.scale
             start, end = start + 12 * along + 3 * across, end - 14 * along + 3 * across
-            pygame.draw.aaline(self._surface, _REQUEST, start, end)
+            self._thin_line(_REQUEST, start, end)
             pygame.draw.polygon(
                 self._surface, _REQUEST, [end, end - 8 * along + 4 * across, end - 8 * along - 4 * across]
             )
@@ -160,7 +164,8 @@ class Renderer:
             if downwash != 1:
                 axes = self.config.radii[i] * np.array([1.0, 1.0, downwash])
                 rim = self._camera.silhouette(pos[i], axes)
-                pygame.draw.lines(self._surface, colour or _blend(colour_of(i), 0.5), True, rim, 2 if colour else 1)
+                width = (2 if colour else 1) * self.scale
+                pygame.draw.lines(self._surface, colour or _blend(colour_of(i), 0.5), True, rim, width)
             elif colour:
                 self._ring(pos[i], self.config.radii[i], colour)
 
@@ -171,15 +176,15 @@ class Renderer:
         rotation = _rotation(phi, theta, psi)
         tips = p + arm * (rotation @ np.array([[1, -1, 1, -1], [1, -1, -1, 1], [0, 0, 0, 0]], float)).T
         screen = self._project(np.vstack([tips, p, p * (1, 1, 0)]))
-        pygame.draw.aaline(self._surface, _GRID, screen[4], screen[5])
-        pygame.draw.line(self._surface, _INK, screen[0], screen[1], 2)
-        pygame.draw.line(self._surface, _INK, screen[2], screen[3], 2)
+        self._thin_line(_GRID, screen[4], screen[5])
+        pygame.draw.line(self._surface, _INK, screen[0], screen[1], 2 * self.scale)
+        pygame.draw.line(self._surface, _INK, screen[2], screen[3], 2 * self.scale)
         for tip in screen[[0, 3]]:  # the two front rotors (+x) are lighter: they show the heading
-            pygame.draw.circle(self._surface, _blend(colour, 0.4), tip, 5)
+            pygame.draw.circle(self._surface, _blend(colour, 0.4), tip, 5 * self.scale)
         for tip in screen[[1, 2]]:
-            pygame.draw.circle(self._surface, colour, tip, 5)
+            pygame.draw.circle(self._surface, colour, tip, 5 * self.scale)
         label = self._font.render(str(i), True, colour)
-        self._surface.blit(label, screen[4] + (8, -20))
+        self._surface.blit(label, screen[4] + np.array([8, -20]) * self.scale)
 
     def _draw_obstacle(self, obstacle: Obstacle) -> None:
         """Draw an obstacle, behind which things show faintly. A pillar is as high as the world: it fades out above the
@@ -208,7 +213,7 @@ class Renderer:
                 left = 1 - k / (_FADE + 1)
                 pygame.draw.polygon(layer, _clear(inside, left * _OPACITY), [*low, *high[::-1]])
                 for side in (0, -1):
-                    pygame.draw.line(layer, _clear(outline, left), low[side], high[side])
+                    pygame.draw.line(layer, _clear(outline, left), low[side], high[side], self.scale)
             pygame.draw.aalines(layer, outline, False, front)
         self._surface.blit(layer, (0, 0))
 
@@ -217,7 +222,7 @@ class Renderer:
         assert self._camera is not None
         away, screen = self._camera.away((points[:-1] + points[1:]) / 2), self._project(points)
         for k in np.flatnonzero((near < away) & (away <= far)):
-            pygame.draw.line(self._surface, colour, screen[k], screen[k + 1], width)
+            pygame.draw.line(self._surface, colour, screen[k], screen[k + 1], width * self.scale)
 
     def _project(self, points: np.ndarray) -> np.ndarray:
         assert self._camera is not None
@@ -225,7 +230,14 @@ class Renderer:
 
     def _polyline(self, points: np.ndarray, colour: str | pygame.Color, width: int) -> None:
         if len(points) > 1:
-            pygame.draw.lines(self._surface, colour, False, self._project(points), width)
+            pygame.draw.lines(self._surface, colour, False, self._project(points), width * self.scale)
+
+    def _thin_line(self, colour: str, start: np.ndarray, end: np.ndarray) -> None:
+        """Draw an antialiased line; those that are wider are smooth once the image is reduced."""
+        if self.scale == 1:
+            pygame.draw.aaline(self._surface, colour, start, end)
+        else:
+            pygame.draw.line(self._surface, colour, start, end, self.scale)
 
     def _ring(self, centre: np.ndarray, radius: float, colour: str) -> None:
         self._polyline(_circle(centre, radius), colour, 2)
