@@ -155,11 +155,19 @@ class Training:
                 put_aside(self.folder)
             else:
                 self.folder = self._claim()
-            callbacks = self.callbacks()
-            env = self.experiment.environments.make(
-                self.experiment.n_envs, self.experiment.env_kwargs, monitor=self.folder, statistics=self._statistics()
-            )
-            model = self._model(env)
+            try:
+                callbacks = self.callbacks()
+                env = self.experiment.environments.make(
+                    self.experiment.n_envs,
+                    self.experiment.env_kwargs,
+                    monitor=self.folder,
+                    statistics=self._statistics(),
+                )
+                model = self._model(env)
+            except Exception:
+                if not self.resumes:  # nothing has been learned: what is refused leaves no run
+                    shutil.rmtree(self.folder, ignore_errors=True)
+                raise
             self._write_settings()
             if self.track is not None:
                 self.track.config.setdefaults({**vars(self.args), "saved_hyperparams": self.experiment.recipe})

@@ -151,3 +151,13 @@ def test_trainings_leave_no_empty_folders_among_the_temporary_files(tmp_path, mo
     model.set_logger(own)
     model.learn(40)
     assert (tmp_path / "SB3-own/progress.csv").exists()
+
+
+@pytest.mark.parametrize("changes", [{"gamma": 7.0}, {"policy": "Nope"}, {"env_kwargs": {"nothing": 1}}])
+def test_a_training_that_is_refused_leaves_no_run(changes, capsys):
+    assert train(**changes) == 2
+    assert "error: " in capsys.readouterr().err
+    assert not any(Path("logs").rglob("*.csv"))
+    assert not any(Path("logs").rglob("OwnBit*"))
+    assert train() == 0
+    assert Path("logs/maddpg/OwnBit-v0_1/OwnBit-v0.zip").is_file()
