@@ -62,7 +62,8 @@ def make_planner(
         SOLVERS.find(solver, ("auto",))
     n_others = n_robots - 1 if config.max_neighbours is None else min(n_robots - 1, config.max_neighbours)
     n_bodies = n_others + min(n_obstacles, config.max_obstacles)
-    problem = make_problem(config, quadrotor, n_bodies, sizes or n_obstacles > 0 or config.downwash != 1)
+    shaped = sizes or n_obstacles > 0 or config.downwash != 1 or config.prediction_penalty != 1
+    problem = make_problem(config, quadrotor, n_bodies, shaped)
     limit = None if n_bodies == n_robots - 1 + n_obstacles else n_bodies
     planner = Planner(_make_solver(problem, solver), model_of(problem), config, limit)
     planner.rate = PlanCost(problem) if costs else None

@@ -162,12 +162,17 @@ def make_problems(
         pushed = None if disturbance is None else disturbance.acceleration
         x = model.ahead(x, u, late * config.planner.dt, pushed)
         resample(believed, late)
-    announced = None
+    announced, penalty = None, None
     if config.planner.right_of_way:
         announced = (source != int(BeliefSource.CONSTANT_VELOCITY)).reshape(-1, source.shape[2])
+    if (of_predicted := config.planner.prediction_penalty) != 1:
+        known = source != int(BeliefSource.CONSTANT_VELOCITY)
+        penalty = np.where(known, 1.0, of_predicted).reshape(-1, source.shape[2])
     others = believed.reshape(-1, *believed.shape[2:])
     # Copies: a solver that writes into its problem must not move robots or goals
-    problems = Problems(x.reshape(-1, 9).copy(), goal.reshape(-1, 3).copy(), others, announced=announced)
+    problems = Problems(
+        x.reshape(-1, 9).copy(), goal.reshape(-1, 3).copy(), others, announced=announced, penalty=penalty
+    )
     if bodies.larger is not None:
         sizes = np.broadcast_to(bodies.larger, believed.shape[:3]).reshape(others.shape[:2])
         problems = problems._replace(size=sizes)
@@ -201,10 +206,10 @@ def _among(
     announced = problems.announced
     if announced is not None:
         announced = np.concatenate([announced, np.zeros((count, k), bool)], axis=1)
-    penalty = None
-    if planner.obstacle_penalty != 1:
-        penalty = np.ones((count, m + k))
-        penalty[:, m:] = planner.obstacle_penalty
+    penalty = problems.penalty
+    if penalty is not None or planner.obstacle_penalty != 1:
+        of_robots = np.ones((count, m)) if penalty is None else penalty
+        penalty = np.concatenate([of_robots, np.full((count, k), planner.obstacle_penalty)], axis=1)
     return problems._replace(
         others=np.concatenate([problems.others, expected], axis=1),
         announced=announced,

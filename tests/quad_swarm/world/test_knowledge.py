@@ -29,17 +29,26 @@ def test_beliefs_begin_without_plans():
     assert beliefs.misfit == pytest.approx(0.5 * CONFIG.planner.separation)
 
 
-def test_violations_of_the_distance_to_obstacles_may_cost_more():
-    pillar = {"position": (0, 0, 0), "radius": 0.2}
-    config = make_config(
-        "flight", {"planner": {"obstacle_penalty": 4.0}, "obstacles": {"listed": [pillar]}}, n_robots=3
-    )
+@pytest.mark.parametrize("obstacles", [{}, {"listed": [{"position": (0, 0, 0), "radius": 0.2}]}])
+@pytest.mark.parametrize(("predicted", "obstacle"), [(1.0, 4.0), (0.25, 4.0), (0.25, 1.0)])
+def test_violations_cost_by_how_certain_a_body_is(predicted, obstacle, obstacles):
+    penalties = {"obstacle_penalty": obstacle, "prediction_penalty": predicted}
+    config = make_config("flight", {"planner": penalties, "obstacles": obstacles}, n_robots=3)
     swarm, seen = Swarm(config), []
     swarm.reset(0, [[-2, 0, 1], [2, 0, 1], [0, 2, 1]], [[2, 0, 1], [-2, 0, 1], [0, -2, 1]])
     plan = swarm.planner.plan
     swarm.planner.plan = lambda problems, last: seen.append(problems) or plan(problems, last)
-    swarm.step(np.zeros((1, 3, 2), bool))
-    assert seen[0].penalty.tolist() == [[1.0, 1.0, 4.0]] * 3
+    some = np.array([[[True, False], [False, False], [True, True]]])
+    reports = [swarm.step(some) for _ in range(4)]
+    sources = np.array([report.belief_source[0] for report in reports])
+    assert len(np.unique(sources == BeliefSource.CONSTANT_VELOCITY)) == 2, "some plans are known"
+    for problems, source in zip(seen, sources, strict=True):
+        if predicted == 1 and not obstacles:
+            assert problems.penalty is None
+            continue
+        of_robots = np.where(source == BeliefSource.CONSTANT_VELOCITY, predicted, 1.0)
+        of_obstacles = np.full((3, swarm.config.obstacles.slots), obstacle)
+        np.testing.assert_array_equal(problems.penalty, np.concatenate([of_robots, of_obstacles], axis=1))
 
 
 @pytest.mark.parametrize("late", [None, 0.5])
