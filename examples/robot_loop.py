@@ -52,7 +52,7 @@ class MyVehicle:
 
 def fly(index, link, begins, ends, results):
     """Fly one robot until some time (us)."""
-    vehicle, limits = MyVehicle(index), SafetyLimits(fence=2.0)
+    vehicle, limits = MyVehicle(index), SafetyLimits(fence=0.5)  # m beyond the workspace: less than to your walls
     loop = Loop(Robot(config, index, RulePolicy("cpa:1.1s:2")), link, vehicle, limits)
     loop.warm_up()
     watchdog = Watchdog(vehicle, limits)

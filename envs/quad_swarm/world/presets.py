@@ -513,14 +513,14 @@ class SwarmConfig:
         field, smaller = next(iter(fitting)), ""
         if all(least <= most and most > 0 for least, most in fitting.values()):
             parts = (
-                f"space.{name}={found if isinstance(getattr(self.space, name), tuple) else found[1]}"
+                f"space.{name}={found if isinstance(getattr(self.space, name), tuple) else found[1]}".replace(" ", "")
                 for name, found in fitting.items()
             )
             smaller = f"{' and '.join(parts)}, or "
         raise ValueError(
             f"space.{field}={getattr(self.space, field)}: starts and goals of {scenario!r} lie up to "
             f"{beyond.max():.3g} m outside the workspace; give {smaller}planner.workspace_low={wider[0]} and "
-            f"planner.workspace_high={wider[1]}, which `make_config` also does if both are left out."
+            f"planner.workspace_high={wider[1]}; left out, both follow the room."
         )
 
     @property

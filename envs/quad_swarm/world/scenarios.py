@@ -420,7 +420,7 @@ def _larger(field: str, n_robots: int, space: ScenarioSpace) -> str:
     low, high = getattr(space, field)
     around = (space.spacing + space.circle_jitter) / (2 * math.sin(math.pi / n_robots))
     least = math.ceil(10 * max(low, around if field == "circle_radius" else 1.2 * around)) / 10
-    return f"[{least}, {round(least + high - low, 3)}]"
+    return f"[{least},{round(least + high - low, 3)}]"
 
 
 class ScenarioSampler:
