@@ -296,10 +296,16 @@ class Loop:
         return None
 
     def _perceived(self) -> Sensed | None:
-        """Return what is perceived, as long as it is finite."""
+        """Return what is perceived, as long as it is finite and not from the future, which a stamp of another clock
+        is: it would never be stale."""
         try:
             sensed = self.vehicle.sense()
             if sensed is not None:
+                if (ahead := (int(sensed.stamp) - self.link.now()) / _US) > _AHEAD:
+                    raise ValueError(
+                        f"the state is from {ahead:.3g} s in the future: stamps are times of the robot's clock, to "
+                        "which link.own converts those that all robots share"
+                    )
                 self._sensed = Sensed(int(sensed.stamp), *self.robot.perceived(*sensed[1:]))
         except Exception as error:
             self._note("sensing", error)

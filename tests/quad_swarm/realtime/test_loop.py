@@ -243,6 +243,18 @@ def test_a_robot_without_a_state_hovers_and_then_lands(bad):
     assert counts["errors: sensing"] == (0 if bad is None else 40)
 
 
+def test_a_state_with_the_stamp_of_another_clock_is_none():
+    """A time of the day would never be stale, and the state would be moved by years."""
+    loop, link, vehicle = make()
+    periods(loop, 2)
+    vehicle.perceived = lambda: Sensed(link.time + 1_700_000_000_000_000, vehicle.state, OTHERS, np.zeros((2, 3)))
+    modes = periods(loop, 24)
+    assert modes[6] is Mode.HOVER
+    assert modes[-1] is Mode.LAND
+    assert loop.statistics.counts["errors: sensing"] >= 24
+    assert "link.own" in loop.statistics.last_error
+
+
 def test_after_landing_the_motors_stop():
     loop, _link, vehicle = make("none", SafetyLimits(fence=0.0))
     vehicle.state[0] = 50.0
