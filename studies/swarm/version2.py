@@ -44,8 +44,8 @@ MODELS = (LEARNED, f"{LEARNED}@0.05")
 # Of the five models, the one that sent least with eight and sixteen robots on validation episodes of version 2, none of
 # which collided; the threshold too
 ONE_MODEL = f"{models('flight')[4]}@0.5"
-# The same model at the highest threshold at which robots among obstacles did not collide on validation episodes
-# (crossing traffic of twelve robots, set 47: 3 of 600 at 0.5)
+# The same model at the highest threshold at which twelve robots did not collide on validation episodes (crossing
+# traffic, set 47: 3 of 600 at 0.5)
 SAFE_MODEL = f"{models('flight')[4]}@0.4"
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
