@@ -180,10 +180,13 @@ def _draws_nothing(asked: str) -> ValueError:
     return ValueError(f"{asked}: the vector environment cannot render; use QuadSwarmEnv.")
 
 
-def _masked(info: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Convert infos to Gymnasium's batched form, where each entry has a mask of the environments it is valid for."""
+def _masked(info: Mapping[str, Any], mask: np.ndarray, metrics: bool = False) -> dict[str, Any]:
+    """Convert infos to Gymnasium's batched form, where each entry has a mask of the environments it is valid for.
+
+    :param metrics: whether they are metrics, which are not valid where they are infinite
+    """
     masked: dict[str, Any] = {}
     for name, value in info.items():
-        masked[name] = _masked(value, mask) if isinstance(value, Mapping) else value
-        masked[f"_{name}"] = mask
+        masked[name] = _masked(value, mask, name == "metrics") if isinstance(value, Mapping) else value
+        masked[f"_{name}"] = mask & np.isfinite(value) if metrics and not np.isfinite(value).all() else mask
     return masked

@@ -179,7 +179,8 @@ class EpisodeStatistics:
         return {name: getattr(self, name)[swarm].item() for name in self._names}
 
     def metrics(self) -> dict[str, np.ndarray]:
-        """Return metrics of the episodes so far by the names under which they are logged, each (E,)."""
+        """Return metrics of the episodes so far by the names under which they are logged, each (E,). The distance to
+        obstacles is infinite where there are none."""
         n, dt = self.config.n_robots, self.config.planner.dt
         plans = self.steps * n
         return {

@@ -4,10 +4,13 @@ import pickle
 from dataclasses import replace
 from unittest.mock import patch
 
+import gymnasium
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from quad_swarm import QuadSwarmEnv
 from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly_steps, run_episodes
@@ -16,6 +19,8 @@ from quad_swarm.world.obstacles import Obstacle, Obstacles, clearances, surround
 from quad_swarm.world.presets import for_scenario, make_config
 from quad_swarm.world.scenarios import MOST_OBSTACLES, SCENARIOS, ScenarioSampler, ScenarioSpace
 from quad_swarm.world.swarm import Swarm
+from sb3_maddpg.common.callbacks import record_metrics
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 
 OURS = sorted(MOST_OBSTACLES)
 SPACE = ScenarioSpace(circle_radius=(2.5, 3.0), half_width=3.0)
@@ -209,6 +214,27 @@ def test_rows_tell_of_obstacles_only_where_there_are_any():
     assert is_row(among)
     assert among.keys() - without.keys() == {"collided_obstacle", "min_obstacle_distance"}
     assert among["min_obstacle_distance"] > 0
+
+
+@pytest.mark.parametrize("kind", ["dummy", "gymnasium"])
+def test_trainings_log_the_distance_to_obstacles_of_episodes_that_have_some(kind):
+    arguments = {"n_robots": 3, "scenario": {"random": 1, "forest": 1}, "max_steps": 2}
+    if kind == "dummy":
+        envs = DummyVecEnv([lambda: QuadSwarmEnv(**arguments)] * 8)
+    else:
+        envs = GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=8, **arguments))
+    envs.seed(1)
+    envs.reset()
+    for _ in range(2):
+        infos = envs.step(np.zeros((8, envs.action_space.n), np.int8))[3]
+    logger = Logger(None, [])
+    record_metrics(logger, infos)
+    assert 0 < logger.name_to_value["swarm/min_obstacle_distance"] < 5
+    told = {name: {} for name in ("random", "forest")}
+    for info in infos:
+        told[info["scenario"]][info["metrics"].get("swarm/min_obstacle_distance")] = True
+    assert list(told["random"]) == [None]
+    assert None not in told["forest"]
 
 
 def test_states_resume_among_obstacles_bit_for_bit():
