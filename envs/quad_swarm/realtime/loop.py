@@ -27,7 +27,7 @@ from quad_swarm.world.obstacles import Obstacle
 _US = 1e6
 _AHEAD = 0.05  # s by which clocks may differ before a plan comes from the future
 _FEW = 3  # unanswered requests from which on nobody seems to be there
-_BRAKING = 0.3  # s in which a robot that hovers comes to rest
+_BRAKING = 0.3  # s in which a robot that hovers or lands comes to rest
 
 
 def freeze_garbage() -> None:
@@ -210,7 +210,7 @@ class Loop:
         self._pending = {}
         sensed = self._perceived()
         mode = self.supervisor.check(now, sensed, self._setpoint, self._unanswered(now))
-        self._plans = mode in (Mode.FLY, Mode.HOVER) and self.supervisor.sees
+        self._plans = mode is not Mode.OFF and self.supervisor.sees
         if self._plans and sensed is not None:
             statistics.durations["sensed"].add(tick - sensed.stamp)
             self._aim(mode, sensed)
@@ -235,6 +235,8 @@ class Loop:
             except Exception as error:  # of a planner from outside, too
                 self._note("planner", error)
                 setpoint = HOVERING
+            if mode is Mode.LAND:  # the planner brakes and evades, but may not want to sink
+                setpoint, plan = np.array([*setpoint[:2], self.supervisor.limits.landing, setpoint[3]]), None
         elif mode is Mode.OFF:
             self._call("vehicle", self.vehicle.disarm)
             return
@@ -350,15 +352,20 @@ class Loop:
             self.robot.sent(other)
 
     def _aim(self, mode: Mode, sensed: Sensed) -> None:
-        """Fly to the goal, or hold the place where hovering began."""
+        """Fly to the goal, or hold the place where hovering or landing began."""
         robot = self.robot
         if self._next is not None:
             robot.fly_to(*self._next)
             self._next = None
         if mode is Mode.FLY:
             robot.hold = None
-        elif robot.hold is None:
+            return
+        if robot.hold is None:
             robot.hold = (sensed.state[POSITION] + _BRAKING * sensed.state[VELOCITY]).reshape(1, 1, 3)
+        if mode is Mode.LAND:
+            planner = robot.config.planner
+            below = self.supervisor.limits.landing * planner.dt * planner.horizon
+            robot.hold[..., 2] = sensed.state[2] + below
 
     def _unanswered(self, now: int) -> float:
         """Return the time without any message in spite of requests (s)."""

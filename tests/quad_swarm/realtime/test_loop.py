@@ -5,6 +5,7 @@ import gc
 import numpy as np
 import pytest
 
+from quad_swarm.quadrotor import VELOCITY
 from quad_swarm.realtime import Loop, Mode, SafetyLimits, Sensed
 from quad_swarm.realtime.loop import thaw_garbage
 from quad_swarm.robot import Plan, Robot, RulePolicy
@@ -253,6 +254,21 @@ def test_a_state_with_the_stamp_of_another_clock_is_none():
     assert modes[-1] is Mode.LAND
     assert loop.statistics.counts["errors: sensing"] >= 24
     assert "link.own" in loop.statistics.last_error
+
+
+def test_a_landing_brakes_and_sinks_whatever_the_planner_wants():
+    loop, _link, vehicle = make("full")
+    periods(loop, 1)
+    vehicle.state[VELOCITY] = [1.5, 0, 0]
+    loop.supervisor.land()
+    assert periods(loop, 1) == [Mode.LAND]
+    _at, setpoint, plan = vehicle.commands[-1]
+    assert setpoint[1] < -0.1, "nose up, against the motion"
+    assert (setpoint[2], plan) == (-0.5, None)
+    assert loop.robot.newest.positions[-1, 2] < 1.4, "others are told that it sinks"
+    loop.robot.plan = lambda: np.full(4, np.nan)
+    periods(loop, 1)
+    assert vehicle.commands[-1][1].tolist() == [0, 0, -0.5, 0]
 
 
 def test_after_landing_the_motors_stop():

@@ -159,3 +159,17 @@ def test_a_robot_that_gets_no_state_lands():
     assert not flight.vehicles.flying[1]
     assert flight.vehicles.flying[[0, 2, 3]].all()
     assert flight.vehicles.collisions() == []
+
+
+def test_a_robot_that_lands_in_flight_brakes():
+    """Level, it would drift for several metres."""
+    flight = flight_of(4)
+    begin(flight, 1)
+    flight.run(1.5)
+    before = flight.vehicles.state[1].copy()
+    assert np.linalg.norm(before[3:5]) > 1.5
+    flight.loops[1].supervisor.land()
+    flight.run(7.0)
+    assert not flight.vehicles.flying[1]
+    assert np.linalg.norm(flight.vehicles.state[1, :2] - before[:2]) < 2.0
+    assert flight.vehicles.collisions() == []
