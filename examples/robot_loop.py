@@ -1,46 +1,57 @@
-"""Two robots in real time over UDP, with a vehicle class of your own: what you write to fly your robots.
+"""The process of one robot, with a vehicle class of your own: what you write to fly your robots over UDP.
 
-`MyVehicle` is what you replace: it says what a robot perceives, and takes its set-points. Here it simulates, so that
-the example runs; on a robot, `sense` reads your state estimator and motion capture, and `command` talks to your
-autopilot. Everything else is what the process of each robot does. Here two of them are threads.
+`MyVehicle` is what you replace: it says what a robot perceives, and takes its set-points. Here it simulates, and a file
+that all processes share stands for motion capture. On robot 1 of two, which flies a policy that `sb3-maddpg export`
+wrote, and begins when all do:
+
+    python robot_loop.py --index 1 --addresses 10.0.0.13:14650 10.0.0.15:14650 --files robots --begins 1764370800000000
+
+Without `--index`, it starts two robots on this machine, which fly past each other.
 """
 
 import argparse
+import socket
+import subprocess
+import sys
+import tempfile
 import threading
+import time
+from pathlib import Path
 
 import numpy as np
 
 from quad_swarm.quadrotor import POSITION, VELOCITY, QuadrotorModel
-from quad_swarm.realtime import Loop, SafetyLimits, Sensed, Watchdog
+from quad_swarm.realtime import Loop, Mode, SafetyLimits, Sensed, Watchdog
 from quad_swarm.realtime.link import monotonic
 from quad_swarm.realtime.udp import UdpLink
-from quad_swarm.robot import Robot, RulePolicy
+from quad_swarm.robot import Robot, RulePolicy, files
 from quad_swarm.world.presets import make_config
 
-parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--quick", action="store_true", help="fly for a second only")
-args = parser.parse_args()
-
-config = make_config("flight", n_robots=2)
-starts, goals = np.array([[-2.0, 0, 1.5], [2.0, 0.1, 1.5]]), np.array([[2.0, 0, 1.5], [-2.0, 0, 1.5]])
-states = np.zeros((2, 9))
-states[:, POSITION] = starts
+# Where the robots hover before, and fly to, in the order of their numbers (m)
+STARTS, GOALS = np.array([[-2.0, 0, 1.5], [2.0, 0.1, 1.5]]), np.array([[2.0, 0, 1.5], [-2.0, 0, 1.5]])
 
 
 class MyVehicle:
-    """A simulated vehicle, which flies for as long as it took until the next command."""
+    """A simulated vehicle, which flies the last set-point until the next one."""
 
-    def __init__(self, index):
-        self.index, self.model, self.then = index, QuadrotorModel(config.quadrotor, 0.01), monotonic()
-        self.setpoint = np.zeros(4)
+    def __init__(self, index, config, shared):
+        self.index, self.model, self.setpoint = index, QuadrotorModel(config.quadrotor, 0.01), np.zeros(4)
+        self.states = np.memmap(shared, float, "r+", shape=(config.n_robots, 9))
+        self.stamp, self.flies = monotonic(), True
+        threading.Thread(target=self.simulate, daemon=True).start()
+
+    def simulate(self):
+        while self.flies:
+            while self.stamp + 10_000 < monotonic():
+                self.states[self.index] = self.model.step(self.states[None, self.index], self.setpoint[None])[0]
+                self.stamp += 10_000
+            time.sleep(0.002)
 
     def sense(self):
-        """Return the newest state of the robot and of the others, and when it was so."""
-        while self.then + 10_000 < monotonic():
-            states[self.index] = self.model.step(states[None, self.index], self.setpoint[None])[0]
-            self.then += 10_000
-        other = states[1 - self.index : 2 - self.index]
-        return Sensed(self.then, states[self.index].copy(), other[:, POSITION].copy(), other[:, VELOCITY].copy())
+        """Return when it was so (us, on this robot's clock), the own state, and where the others are and fly to."""
+        stamp, states = self.stamp, np.array(self.states)
+        others = np.delete(states, self.index, axis=0)
+        return Sensed(stamp, states[self.index], others[:, POSITION], others[:, VELOCITY])
 
     def command(self, setpoint, plan):
         """Fly a set-point: roll, pitch (rad), climb rate (m/s), yaw rate (rad/s)."""
@@ -48,32 +59,83 @@ class MyVehicle:
 
     def disarm(self):
         """Stop the motors."""
+        self.flies = False
 
 
-def fly(index, link, begins, ends, results):
-    """Fly one robot until some time (us)."""
-    vehicle, limits = MyVehicle(index), SafetyLimits(fence=0.5)  # m beyond the workspace: less than to your walls
-    loop = Loop(Robot(config, index, RulePolicy("cpa:1.1s:2")), link, vehicle, limits)
-    loop.warm_up()
+def with_rule(index, n_robots):
+    """Return a robot that asks those whom it would come close to."""
+    return Robot(make_config("flight-v2", n_robots=n_robots), index, RulePolicy("cpa:1.1s:2"))
+
+
+def fly(index, addresses, begins, duration, folder, shared):
+    """Fly one robot, from the time of the day at which all begin (us), and land after some time (s)."""
+    robot = files.load(folder).robot(index) if folder else with_rule(index, len(addresses))
+    if len(addresses) != robot.config.n_robots:
+        raise SystemExit(f"{len(addresses)} addresses for the {robot.config.n_robots} robots of {folder}")
+    (host, port), others = addresses[index], {k: a for k, a in enumerate(addresses) if k != index}
+    link = UdpLink(index, others, host, port, session=7)  # a session that all share
+    vehicle = MyVehicle(index, robot.config, shared)
+    limits = SafetyLimits(fence=0.5)  # m beyond the workspace: less than to your walls
+    loop = Loop(robot, link, vehicle, limits)
+    loop.warm_up()  # the first time on a machine, it compiles the planner
+    if link.own(begins) < monotonic():
+        raise SystemExit(f"robot {index}: it is too late to begin; the others must not start, either")
     watchdog = Watchdog(vehicle, limits)
-    loop.start(starts[index], goals[index], begins)
-    results[index] = loop.run(lambda: monotonic() > ends, lambda loop: watchdog.beat())
+    loop.start(STARTS[index], GOALS[index], link.own(begins))
+    ends = link.own(begins) + round(duration * 1e6)
+
+    def ended():
+        if monotonic() > ends:
+            loop.supervisor.land()
+        return loop.supervisor.mode is Mode.OFF
+
+    statistics = loop.run(ended, lambda loop: watchdog.beat())
     watchdog.close()
-
-
-links = [UdpLink(index) for index in range(2)]
-for link in links:  # on a network: the addresses of the robots, such as ("192.168.1.12", 14650)
-    link.addresses = {other.index: other.address for other in links}
-results = {}
-begins = monotonic() + 1_000_000
-ends = begins + (1_000_000 if args.quick else 6_000_000)
-threads = [threading.Thread(target=fly, args=(link.index, link, begins, ends, results)) for link in links]
-for thread in threads:
-    thread.start()
-for thread in threads:
-    thread.join()
-for index, statistics in sorted(results.items()):
+    link.close()
     counts, waits = statistics.counts, statistics.durations["round_trip"]
-    distance = np.linalg.norm(states[index, POSITION] - goals[index])
-    print(f"robot {index}: {counts['periods']} periods, {counts['missed']} missed, {distance:.2f} m from its goal")
-    print(f"         {counts['requests']} requests, answered after {waits.quantile(0.5) / 1000:.1f} ms")
+    distance = np.linalg.norm(vehicle.sense().state[:2] - GOALS[index, :2])
+    print(
+        f"robot {index}: {counts['periods']} periods, {counts['missed']} missed; {counts['requests']} requests, "
+        f"answered after {waits.quantile(0.5) / 1000:.1f} ms; landed {distance:.2f} m beside its goal"
+    )
+
+
+def fly_all(duration):
+    """Start a process for each robot on this machine."""
+    link = UdpLink(0)
+    Loop(with_rule(0, len(STARTS)), link, None).warm_up()  # compile once, not in each process
+    link.close()
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in STARTS]
+    for one in sockets:
+        one.bind(("127.0.0.1", 0))
+    addresses = ["{}:{}".format(*one.getsockname()) for one in sockets]
+    for one in sockets:
+        one.close()
+    with tempfile.TemporaryDirectory() as folder:
+        shared = Path(folder) / "states"
+        np.hstack([STARTS, np.zeros((len(STARTS), 6))]).tofile(shared)
+        words = ["--addresses", *addresses, "--begins", str(time.time_ns() // 1000 + 10_000_000)]
+        words += ["--duration", str(duration), "--shared", str(shared)]
+        command = [sys.executable, __file__]
+        robots = [subprocess.Popen([*command, "--index", str(k), *words]) for k in range(len(STARTS))]
+        if any([robot.wait() for robot in robots]):
+            raise SystemExit("a robot ended with an error")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--index", type=int, help="number of this robot")
+    parser.add_argument("--addresses", nargs="+", metavar="HOST:PORT", help="where robots receive, by their numbers")
+    parser.add_argument("--begins", type=int, metavar="US", help="when all begin: microseconds of the time of the day")
+    parser.add_argument("--duration", type=float, default=6.0, metavar="S", help="when to land")
+    parser.add_argument("--files", metavar="FOLDER", help="an exported policy and its world; by default, a rule flies")
+    parser.add_argument("--shared", metavar="FILE", help="states of the simulated vehicles")
+    parser.add_argument("--quick", action="store_true", help="fly for a second only")
+    args = parser.parse_args()
+    if args.index is None:
+        fly_all(1.0 if args.quick else args.duration)
+    elif args.addresses is None or args.begins is None:
+        parser.error("--index needs --addresses and --begins")
+    else:
+        places = [(host, int(port)) for host, port in (one.rsplit(":", 1) for one in args.addresses)]
+        fly(args.index, places, args.begins, args.duration, args.files, args.shared)
