@@ -174,6 +174,33 @@ EXPORT void quad_swarm_approach(Integer n_robots, Integer n_others, Integer n_st
   }
 }
 
+EXPORT void quad_swarm_nearest_obstacle(Integer n_swarms, Integer n_pairs, Integer n_stages, Integer n_obstacles,
+                                        const double* trajectories, const double* radii, const double* centres,
+                                        const double* factors, const double* radius, const Flag* present, double* gap,
+                                        Integer* stage, double* towards) {
+  for (Integer pair = 0; pair < n_swarms * n_pairs; pair++) {
+    const double* path = trajectories + 3 * n_stages * pair;
+    double least = std::numeric_limits<double>::infinity(), away = 1.0, way[3] = {0.0, 0.0, 0.0};
+    Integer reached = 0;
+    const Integer first = pair / n_pairs * n_obstacles;
+    for (Integer obstacle = first; obstacle < first + n_obstacles; obstacle++) {
+      if (!present[obstacle]) continue;
+      const double *factor = factors + 3 * obstacle, *centre = centres + 3 * n_stages * obstacle;
+      const double reach = radius[obstacle] + radii[pair];
+      for (Integer k = 0; k < n_stages; k++) {
+        double between[3];
+        for (int i = 0; i < 3; i++) between[i] = factor[i] * (centre[3 * k + i] - path[3 * k + i]);
+        const double apart = std::sqrt(dot(between, between));
+        if (!(apart - reach < least)) continue;
+        least = apart - reach, away = apart, reached = k;
+        std::copy(between, between + 3, way);
+      }
+    }
+    gap[pair] = least, stage[pair] = reached;
+    for (int i = 0; i < 3; i++) towards[3 * pair + i] = way[i] / std::max(away, 1e-6);
+  }
+}
+
 EXPORT void quad_swarm_resample(Integer n_robots, Integer n_rows, Integer n_stages, const double* later,
                                 double* trajectories) {
   for (Integer robot = 0; robot < n_robots; robot++) {

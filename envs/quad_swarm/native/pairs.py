@@ -175,6 +175,42 @@ def approach(
     return distances.min(axis=-1), distances.argmin(axis=-1), distances[..., -1]
 
 
+def nearest_obstacle(
+    trajectories: np.ndarray,
+    radii: np.ndarray,
+    centres: np.ndarray,
+    factors: np.ndarray,
+    radius: np.ndarray,
+    present: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the points of trajectories that are nearest to the surface of an obstacle.
+
+    :param trajectories: positions at the next N steps, (E, pairs, N, 3), world frame (m)
+    :param radii: radii of the robots that fly them, (E, pairs) (m)
+    :param centres: where the obstacles will be, (E, obstacles, N, 3), world frame (m)
+    :param factors: factors of their metrics, (E, obstacles, 3), see `quad_swarm.world.obstacles`
+    :param radius: radii of the obstacles, (E, obstacles) (m)
+    :param present: which obstacles there are, (E, obstacles) bool
+    :return: distances between the surfaces there, infinite without obstacles (m), the first steps at which they are
+        reached, counting from 0, (E, pairs) each, and directions to the obstacles, (E, pairs, 3)
+    """
+    if (functions := compiled()) is not None:
+        return functions.nearest_obstacle(
+            trajectories=trajectories, radii=radii, centres=centres, factors=factors, radius=radius, present=present
+        )
+    between = factors[:, None, :, None] * (centres[:, None] - trajectories[:, :, None])
+    distance = length(between)
+    gaps = distance - (radius[:, None] + radii[..., None])[..., None]
+    gaps[np.broadcast_to(~present[:, None, :, None], gaps.shape)] = np.inf
+    flat = gaps.reshape(*radii.shape, gaps.shape[2] * gaps.shape[3])
+    nearest = flat.argmin(axis=-1)[..., None]
+    gap = np.take_along_axis(flat, nearest, axis=-1)[..., 0]
+    away = np.take_along_axis(distance.reshape(flat.shape), nearest, axis=-1)
+    towards = np.take_along_axis(between.reshape(*flat.shape, 3), nearest[..., None], axis=-2)[..., 0, :]
+    towards = np.where(np.isfinite(gap)[..., None], towards / np.maximum(away, 1e-6), 0.0)
+    return gap, nearest[..., 0] % trajectories.shape[2], towards
+
+
 def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
     """Resample trajectories at later times, in place, by linear interpolation. The last segment continues in a straight
     line.

@@ -28,7 +28,7 @@ STATISTICS = np.dtype(
 )
 
 # E: swarms, n or R: robots, m or M: the others of a robot, P: pairs, N: stages of a plan, K: some of them, A: answers,
-# S: sub-steps
+# S: sub-steps, O: obstacles
 _REMEMBER = Signature(
     "quad_swarm_remember",
     "P N",
@@ -84,6 +84,19 @@ _APPROACH = Signature(
     least="*R M f8 out",
     nearest="*R M i8 out",
     last="*R M f8 out",
+)
+_NEAREST_OBSTACLE = Signature(
+    "quad_swarm_nearest_obstacle",
+    "E P N O",
+    trajectories="E P N 3 f8",
+    radii="E P f8",
+    centres="E O N 3 f8",
+    factors="E O 3 f8",
+    radius="E O f8",
+    present="E O bool",
+    gap="E P f8 out",
+    stage="E P i8 out",
+    towards="E P 3 f8 out",
 )
 _RESAMPLE = Signature(
     "quad_swarm_resample",
@@ -165,6 +178,7 @@ TABLE: dict[str, Signature] = {
     "believe": _BELIEVE,
     "receive": _RECEIVE,
     "approach": _APPROACH,
+    "nearest_obstacle": _NEAREST_OBSTACLE,
     "resample": _RESAMPLE,
     "keep_right": _KEEP_RIGHT,
     "neighbours": _NEIGHBOURS,

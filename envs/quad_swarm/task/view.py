@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quad_swarm.geometry import closest_approach, flattened, length
-from quad_swarm.native.pairs import advance
+from quad_swarm.native.pairs import advance, nearest_obstacle
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import PlanApproach, Prediction, of_others
 from quad_swarm.world.knowledge import Knowledge, SeenByOthers
@@ -195,18 +195,15 @@ class View:
             found = ObstacleApproach(np.full(shape, np.inf), np.zeros(shape, np.int64), np.zeros((*shape, 3)))
         else:
             times = config.planner.dt * np.arange(1.0, self.horizon + 1)
-            centres = obstacles.ahead(np.broadcast_to(times, (*shape[:2], self.horizon)))[:, :, None]
-            between = obstacles.factors[:, None, None, :, None] * (centres - trajectories[:, :, :, None])
-            distance = length(between)
-            gaps = distance - (obstacles.radius[:, None, None] + radii[..., None])[..., None]
-            gaps[np.broadcast_to(~obstacles.present[:, None, None, :, None], gaps.shape)] = np.inf
-            flat = gaps.reshape(*shape, -1)
-            nearest = flat.argmin(axis=-1)[..., None]
-            away = np.take_along_axis(distance.reshape(*shape, -1), nearest, axis=-1)
-            towards = np.take_along_axis(between.reshape(*shape, -1, 3), nearest[..., None], axis=-2)[..., 0, :]
-            gap = np.take_along_axis(flat, nearest, axis=-1)[..., 0]
-            towards = np.where(np.isfinite(gap)[..., None], towards / np.maximum(away, 1e-6), 0.0)
-            found = ObstacleApproach(gap, nearest[..., 0] % self.horizon, towards)
+            nearest = nearest_obstacle(
+                trajectories.reshape(shape[0], -1, self.horizon, 3),
+                np.broadcast_to(radii, shape).reshape(shape[0], -1),
+                obstacles.ahead(np.broadcast_to(times, (shape[0], 1, self.horizon)))[:, 0],
+                obstacles.factors,
+                obstacles.radius,
+                obstacles.present,
+            )
+            found = ObstacleApproach(*(array.reshape(*shape, *array.shape[2:]) for array in nearest))
         return found if chosen is None else ObstacleApproach(*(array[:, :, chosen] for array in found))
 
     def approach(self, look_ahead: float) -> tuple[np.ndarray, np.ndarray]:

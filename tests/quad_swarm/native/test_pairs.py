@@ -32,6 +32,10 @@ def scene(n_swarms: int, n: int, horizon: int, seed: int = 0) -> SimpleNamespace
         plan=rng.normal(size=(n_swarms, n, horizon, 3)).cumsum(axis=-2),
         later=rng.random((n_swarms, n)),
         vels=rng.normal(size=(n_swarms, n, 3)),
+        centres=rng.normal(size=(n_swarms, 3, horizon, 3)),
+        factors=rng.choice([0.0, 0.5, 1.0], (n_swarms, 3, 3)),
+        radius=rng.random((n_swarms, 3)),
+        present=rng.random((n_swarms, 3)) < 0.7,
         path=rng.normal(size=(1, n_swarms, n, 3)) + 0.2 * rng.normal(size=(4, n_swarms, n, 3)).cumsum(axis=0),
     )
 
@@ -54,6 +58,9 @@ def everything(s: SimpleNamespace) -> dict[str, list[np.ndarray]]:
     resampled = pairs.believe(*belief, DT)
     others = resampled.reshape(s.x.shape[0], *resampled.shape[2:]).copy()
     pairs.resample(resampled, s.later)
+    n_swarms, *_, horizon, _ = s.remembered.shape
+    n_paths = s.age[:1].size
+    paths = s.remembered[..., 1:, :].reshape(n_swarms, n_paths, horizon - 1, 3), s.age.reshape(n_swarms, n_paths) / 9
     near = neighbourhoods(s)
     answers = []
     for k, ages in enumerate((s.ages, 2, s.ages[:0])):
@@ -67,6 +74,7 @@ def everything(s: SimpleNamespace) -> dict[str, list[np.ndarray]]:
         "remember": list(pairs.remember(s.remembered, s.age, s.pos, 0.03)),
         "believe": [pairs.believe(*belief, DT), pairs.believe(*belief, DT, [2, 0])],
         "approach": list(pairs.approach(s.own, s.plan, *belief, DT)),
+        "nearest_obstacle": list(pairs.nearest_obstacle(*paths, s.centres, s.factors, s.radius, s.present)),
         "resample": [resampled],
         "neighbours": [array for step in near for array in step],
         "keep_right": list(pairs.keep_right(s.x, others, s.remembers.reshape(others.shape[:2]), 0.3, DT, 1.0, 0.5)),
@@ -121,3 +129,16 @@ def test_the_first_of_equally_close_stages_is_named(either):
     never = np.zeros((1, 1, 1), bool)
     least, stage, last = pairs.approach(np.zeros((1, 1, 3)), plan, pos, vel, np.zeros((1, 1, 1, 5, 3)), never, DT)
     assert (least.item(), stage.item(), last.item()) == (1.0, 1, 1.5)
+
+
+def test_the_nearest_obstacle_is_that_whose_surface_is(either):
+    """A ball of 1 m, 3 m away, is farther than a pillar of 2 m, 3.5 m away, whose height does not count; the third is
+    not there."""
+    path = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0, 0]])[None, None]
+    centres = np.array([[-3.0, 0, 0], [4.0, 0, 9], [0.5, 0, 0]])[None, :, None] * np.ones((3, 1))
+    factors, radius = np.array([[[1.0, 1, 1], [1, 1, 0], [1, 1, 1]]]), np.array([[1.0, 2.0, 1.0]])
+    present = np.array([[True, True, False]])
+    gap, stage, towards = pairs.nearest_obstacle(path, np.array([[0.25]]), centres, factors, radius, present)
+    assert (gap.item(), stage.item(), towards.tolist()) == (1.25, 1, [[[1.0, 0.0, 0.0]]])
+    gap, stage, towards = pairs.nearest_obstacle(path, np.array([[0.25]]), centres, factors, radius, present & False)
+    assert (gap.item(), stage.item(), towards.tolist()) == (np.inf, 0, [[[0.0, 0.0, 0.0]]])
