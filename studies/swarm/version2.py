@@ -1,4 +1,4 @@
-"""Fly the sealed tests of `flight-v2`: full communication, none, rules, a model of version 1, and rivals.
+"""Fly the sealed tests of `flight-v2`: full communication, none, rules, models, and rivals.
 
 ``python -m studies.swarm.version2 [--part full ...] [--episodes ...] [--jobs 2] [--json F]`` flies sets on which
 nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios with eight robots), ``sixteen``,
@@ -10,7 +10,9 @@ set 704 the same of four, twelve and sixteen (``four_again``, ``twelve_again``, 
 ``one_small`` and ``one_large``, one model of version 1 at one threshold, with four to sixteen robots; set 706
 ``safe_small`` and ``safe_large``, the same model at a lower threshold, and ``among_four``, ``among_eight``,
 ``among_twelve`` and ``among_sixteen``, full communication and that model among obstacles, after these had been given a
-larger penalty than robots. All earlier parts fly with equal penalties, as they did. JSON: one row per
+larger penalty than robots; set 707 ``trained_four``, ``trained_eight``, ``trained_twelve`` and ``trained_sixteen``, the
+packaged model, which was trained in version 2 and with obstacles. All parts before set 706 fly with equal penalties, as
+they did. JSON: one row per
 policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run that is ended
 keeps what it has.
 """
@@ -36,7 +38,7 @@ from studies.swarm.experiment import condition
 from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
-SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG = range(700, 707)
+SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED = range(700, 708)
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -47,6 +49,8 @@ ONE_MODEL = f"{models('flight')[4]}@0.5"
 # The same model at the highest threshold at which twelve robots did not collide on validation episodes (crossing
 # traffic, set 47: 3 of 600 at 0.5)
 SAFE_MODEL = f"{models('flight')[4]}@0.4"
+# The model that was trained in version 2, at the threshold that was chosen on sets 51 and 52
+OWN_MODEL = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.4"
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
 CHECKED: dict[str, Any] = {"radio": {"jitter": 0}, "planner": {"commitment": 0.0}}
@@ -107,6 +111,10 @@ PARTS = {
     "among_eight": Part(("full", SAFE_MODEL), tuple(MOST_OBSTACLES), (8,), 4000, AMONG),
     "among_twelve": Part(("full", SAFE_MODEL), tuple(MOST_OBSTACLES), (12,), 2000, AMONG),
     "among_sixteen": Part(("full", SAFE_MODEL), tuple(MOST_OBSTACLES), (16,), 2000, AMONG),
+    "trained_eight": Part((OWN_MODEL,), EVERYWHERE, (8,), 2000, TRAINED),
+    "trained_twelve": Part((OWN_MODEL,), EVERYWHERE, (12,), 2000, TRAINED),
+    "trained_sixteen": Part((OWN_MODEL,), EVERYWHERE, (16,), 2000, TRAINED),
+    "trained_four": Part((OWN_MODEL,), EVERYWHERE, (4,), 2000, TRAINED),
 }
 
 
@@ -137,7 +145,9 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
 
 
 def _name(policy: str) -> str:
-    return policy.replace(LEARNED, "pretrained:quad-swarm-flight")
+    for model in ("quad-swarm-flight", "quad-swarm-flight-v2"):
+        policy = policy.replace(str(pretrained_folder(model) / "model.zip"), f"pretrained:{model}")
+    return policy
 
 
 OUTCOME = ("collided", "95 % interval", "1 % closer than", "plans", "arrived", "steps")

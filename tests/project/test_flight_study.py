@@ -36,8 +36,9 @@ def test_sets_of_episodes_are_apart():
         version2.AGAIN,
         version2.ONE,
         version2.AMONG,
+        version2.TRAINED,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 14
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 15
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
