@@ -242,24 +242,28 @@ def random_return(env: str, actions: str) -> float:
 
 
 def plot(rows: Sequence[Row], file: Path) -> None:
-    """Draw the learning curves with 95 % t-intervals and the return of random actions, with a panel per environment."""
+    """Draw the learning curves with 95 % t-intervals and the return of random actions, with a panel for each
+    environment and kind of actions."""
     groups = grouped(rows)
-    envs = list(dict.fromkeys(env for env, _, _ in groups))
-    labels = list(dict.fromkeys((algo, actions) for _, actions, algo in groups))
+    kinds = list(dict.fromkeys((env, actions) for env, actions, _ in groups))
+    algos = list(dict.fromkeys(algo for _, _, algo in groups))
+    height = math.ceil(len(kinds) / 2)
     with rc_context(STYLE):
-        figure = Figure(figsize=(8, 2.9 * math.ceil(len(envs) / 2)), layout="constrained")
-        panels = list(figure.subplots(math.ceil(len(envs) / 2), min(len(envs), 2), squeeze=False).flat)
-        for axes, env in zip(panels, envs, strict=False):
-            for (of, actions, algo), seeds in groups.items():
-                if of == env:
-                    _draw_curve(axes, seeds, f"{algo.upper()}, {actions} actions", labels.index((algo, actions)))
-            level = random_return(env, "continuous")
-            axes.axhline(level, color=RULES, linewidth=1, linestyle=(0, (2, 2)), label="random actions (continuous)")
-            axes.set_title(env.removeprefix("mpe2/"))
+        figure = Figure(figsize=(8, 2.7 * height), layout="constrained")
+        panels = list(figure.subplots(height, min(len(kinds), 2), squeeze=False).flat)
+        for axes, kind in zip(panels, kinds, strict=False):
+            for (*of, algo), seeds in groups.items():
+                if tuple(of) == kind:
+                    _draw_curve(axes, seeds, algo.upper(), algos.index(algo))
+            level = random_return(*kind)
+            axes.axhline(level, color=RULES, linewidth=1, linestyle=(0, (2, 2)), label="random actions")
+            axes.set_title("{}, {} actions".format(kind[0].removeprefix("mpe2/"), kind[1]))
             axes.set_ylabel("return, mean over agents")
             axes.set_xlabel("environment steps (thousands)")
+        for axes in panels[len(kinds) :]:
+            axes.set_visible(False)
         shown = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2)
+        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=len(shown))
         file.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(file)
     print(f"Figure: {file}")
