@@ -20,7 +20,9 @@ from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 from sb3_maddpg.hub.pretrained import pretrained_folder
 
-MODEL = str(pretrained_folder("quad-swarm-flight") / "model.zip")
+MODEL, AMONG_OBSTACLES = (
+    str(pretrained_folder(name) / "model.zip") for name in ("quad-swarm-flight", "quad-swarm-flight-v2")
+)
 EDGE = 1e-5  # of a probability to the threshold, within which a robot alone and a team may round differently
 RULES = ["none", "full", "cpa:1.2s:3&stale:4", "event:0.05|push:0.1"]
 
@@ -202,7 +204,8 @@ def test_robots_fly_as_the_swarm_in_changed_worlds(world):
 def test_robots_with_a_learned_policy_fly_as_the_swarm(preset, n, tmp_path):
     pytest.importorskip("onnxruntime")
     config = make_config(preset, n_robots=n)
-    written, model = export(MODEL, config, tmp_path), load_model(MODEL, "sb3_maddpg:MADDPG")
+    path = AMONG_OBSTACLES if preset == "flight-v2" else MODEL
+    written, model = export(path, config, tmp_path), load_model(path, "sb3_maddpg:MADDPG")
     edges = []
 
     def at_edge(observed, differing):
