@@ -20,7 +20,7 @@ SHIPPED = {
     "quad-swarm-any": ("dense", {8: 0.17, 12: 0.18}),
     "quad-swarm-dense": ("dense", {8: 0.122}),
     "quad-swarm-flight": ("flight", {8: 0.011}),
-    "quad-swarm-flight-v2": ("flight-v2", {8: 0.0205}),
+    "quad-swarm-flight-v2": ("flight-v2", {8: 0.0346}),
     "quad-swarm-paper": ("paper", {4: 0.04}),
 }
 
