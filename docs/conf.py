@@ -32,7 +32,7 @@ html_css_files = ["tables.css"]
 html_js_files = ["keyboard.js", "tablesort.min.js", "sort.js"]
 
 smartquotes_action = "qe"  # no dashes: options begin with two hyphens
-myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
+myst_enable_extensions = ["tasklist", "dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # `python -m studies.notebooks` keeps the outputs in the notebooks
 
