@@ -75,7 +75,7 @@ def fly(index, addresses, begins, duration, folder, shared):
     (host, port), others = addresses[index], {k: a for k, a in enumerate(addresses) if k != index}
     link = UdpLink(index, others, host, port, session=7)  # a session that all share
     vehicle = MyVehicle(index, robot.config, shared)
-    limits = SafetyLimits(fence=0.5)  # m beyond the workspace: less than to your walls
+    limits = SafetyLimits(fence=0.5)  # m beyond the workspace, and some more to brake: all that before your walls
     loop = Loop(robot, link, vehicle, limits)
     loop.warm_up()  # the first time on a machine, it compiles the planner
     if link.own(begins) < monotonic():

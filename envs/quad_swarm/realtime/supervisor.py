@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -212,4 +213,5 @@ class Watchdog:
             self.barks += not barking
             barking = True
             lands = silent > self._limits.hung + self._limits.lost
-            self._vehicle.command(np.array([0.0, 0.0, self._limits.landing, 0.0]) if lands else HOVERING, None)
+            with contextlib.suppress(Exception):  # of a vehicle from outside, which must not end this thread
+                self._vehicle.command(np.array([0.0, 0.0, self._limits.landing, 0.0]) if lands else HOVERING, None)
