@@ -154,7 +154,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         if terminated or truncated:
             final = info_of(self.task.final_info(), 0)
             info["is_success"] = final["is_success"]
-            info["metrics"] |= {name: value for name, value in final["metrics"].items() if np.isfinite(value)}
+            info["metrics"] |= {name: value for name, value in final["metrics"].items() if not np.isinf(value)}
         if self.render_mode == "human":
             self.render()
         return self.task.observe()[0], float(outcome.reward[0]), terminated, truncated, info

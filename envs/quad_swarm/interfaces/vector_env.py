@@ -188,5 +188,5 @@ def _masked(info: Mapping[str, Any], mask: np.ndarray, metrics: bool = False) ->
     masked: dict[str, Any] = {}
     for name, value in info.items():
         masked[name] = _masked(value, mask, name == "metrics") if isinstance(value, Mapping) else value
-        masked[f"_{name}"] = mask & np.isfinite(value) if metrics and not np.isfinite(value).all() else mask
+        masked[f"_{name}"] = mask & ~np.isinf(value) if metrics and np.isinf(value).any() else mask
     return masked

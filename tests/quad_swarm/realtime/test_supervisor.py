@@ -176,3 +176,19 @@ def test_a_loop_that_hangs_is_noticed():
     before = len(vehicle.commands)
     time.sleep(0.1)
     assert len(vehicle.commands) == before
+
+
+def test_an_error_of_the_vehicle_does_not_end_the_watchdog():
+    calls, enough = [], threading.Event()
+
+    class Vehicle:
+        def command(self, setpoint, plan):
+            calls.append(setpoint)
+            if len(calls) == 3:
+                enough.set()
+            raise OSError("no link")
+
+    watchdog = Watchdog(Vehicle(), SafetyLimits(hung=0.02))
+    watchdog.beat()
+    assert enough.wait(30)
+    watchdog.close()
