@@ -1,15 +1,17 @@
 """The process of one robot, with a vehicle class of your own: what you write to fly your robots over UDP.
 
-`MyVehicle` is what you replace: it says what a robot perceives, and takes its set-points. Here it simulates, and a file
-that all processes share stands for motion capture. On robot 1 of two, which flies a policy that `sb3-maddpg export`
-wrote, and begins when all do:
+`MyVehicle` is what you replace, with `STARTS` and `GOALS`: it says what a robot perceives, and takes its set-points.
+Here it simulates, and a file that all processes share (--shared) stands for motion capture. On robot 1 of two, which is
+in the air, flies a policy that `sb3-maddpg export` wrote, and begins when all do:
 
     python robot_loop.py --index 1 --addresses 10.0.0.13:14650 10.0.0.15:14650 --files robots --begins 1764370800000000
 
-Without `--index`, it starts two robots on this machine, which fly past each other.
+It holds its start until then, and lands when its time is over, and at Ctrl-C; a second one ends it in the air. Without
+`--index`, it starts two robots on this machine, which fly past each other.
 """
 
 import argparse
+import signal
 import socket
 import subprocess
 import sys
@@ -23,11 +25,12 @@ import numpy as np
 from quad_swarm.quadrotor import POSITION, VELOCITY, QuadrotorModel
 from quad_swarm.realtime import Loop, Mode, SafetyLimits, Sensed, Watchdog
 from quad_swarm.realtime.link import monotonic
+from quad_swarm.realtime.loop import freeze_garbage
 from quad_swarm.realtime.udp import UdpLink
 from quad_swarm.robot import Robot, RulePolicy, files
 from quad_swarm.world.presets import make_config
 
-# Where the robots hover before, and fly to, in the order of their numbers (m)
+# Where the robots hover before, and fly to, a row for each in the order of their numbers (m)
 STARTS, GOALS = np.array([[-2.0, 0, 1.5], [2.0, 0.1, 1.5]]), np.array([[2.0, 0, 1.5], [-2.0, 0, 1.5]])
 
 
@@ -68,28 +71,49 @@ def with_rule(index, n_robots):
 
 
 def fly(index, addresses, begins, duration, folder, shared):
-    """Fly one robot, from the time of the day at which all begin (us), and land after some time (s)."""
+    """Fly one robot to its goal from the time of the day at which all begin (us) on, and land after some time (s)."""
     robot = files.load(folder).robot(index) if folder else with_rule(index, len(addresses))
-    if len(addresses) != robot.config.n_robots:
-        raise SystemExit(f"{len(addresses)} addresses for the {robot.config.n_robots} robots of {folder}")
+    if not len(addresses) == len(STARTS) == len(GOALS) == robot.config.n_robots:
+        counts = f"{len(addresses)} addresses, {len(STARTS)} STARTS and {len(GOALS)} GOALS"
+        raise SystemExit(f"{counts} for {robot.config.n_robots} robots")
     (host, port), others = addresses[index], {k: a for k, a in enumerate(addresses) if k != index}
     link = UdpLink(index, others, host, port, session=7)  # a session that all share
     vehicle = MyVehicle(index, robot.config, shared)
     limits = SafetyLimits(fence=0.5)  # m beyond the workspace, and some more to brake: all that before your walls
     loop = Loop(robot, link, vehicle, limits)
     loop.warm_up()  # the first time on a machine, it compiles the planner
-    if link.own(begins) < monotonic():
+    freeze_garbage()
+    begins = link.own(begins)
+    if begins < monotonic():
         raise SystemExit(f"robot {index}: it is too late to begin; the others must not start, either")
+    try:
+        state = loop.ready().state
+    except ValueError as error:
+        raise SystemExit(f"robot {index}: {error}") from None
+    if (beside := np.linalg.norm(state[POSITION] - STARTS[index])) > 0.3:
+        raise SystemExit(f"robot {index} is {beside:.1f} m beside its start, {STARTS[index].tolist()}")
+
     watchdog = Watchdog(vehicle, limits)
-    loop.start(STARTS[index], GOALS[index], link.own(begins))
-    ends = link.own(begins) + round(duration * 1e6)
+    # Obstacles are given here, or listed in the exported world
+    loop.start(STARTS[index], GOALS[index], link.now() + robot.period, heading=state[8], begins=begins)
+
+    def land(*_):
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a second one ends the process in the air
+        loop.supervisor.land()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, land)
 
     def ended():
-        if monotonic() > ends:
+        if monotonic() > begins + round(duration * 1e6):
             loop.supervisor.land()
-        return loop.supervisor.mode is Mode.OFF
+        return loop.has_landed
 
-    statistics = loop.run(ended, lambda loop: watchdog.beat())
+    def after_period(loop):
+        watchdog.beat(armed=loop.supervisor.mode is not Mode.OFF)
+
+    print(f"robot {index} holds its start for {(begins - monotonic()) / 1e6:.1f} s", flush=True)
+    statistics = loop.run(ended, after_period)
     watchdog.close()
     link.close()
     counts, waits = statistics.counts, statistics.durations["round_trip"]
@@ -118,6 +142,7 @@ def fly_all(duration):
         words += ["--duration", str(duration), "--shared", str(shared)]
         command = [sys.executable, __file__]
         robots = [subprocess.Popen([*command, "--index", str(k), *words]) for k in range(len(STARTS))]
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the robots, which land
         if any([robot.wait() for robot in robots]):
             raise SystemExit("a robot ended with an error")
 
@@ -136,6 +161,8 @@ if __name__ == "__main__":
         fly_all(1.0 if args.quick else args.duration)
     elif args.addresses is None or args.begins is None:
         parser.error("--index needs --addresses and --begins")
+    elif args.shared is None:
+        parser.error("--shared: MyVehicle simulates, and needs the file; replace it by the class of your vehicle")
     else:
         places = [(host, int(port)) for host, port in (one.rsplit(":", 1) for one in args.addresses)]
         fly(args.index, places, args.begins, args.duration, args.files, args.shared)

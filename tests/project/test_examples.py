@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -34,6 +35,17 @@ def test_runs_in_its_short_form(name, tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout
     assert f"]({name})" in (EXAMPLES / "README.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_robot_lands_at_ctrl_c(tmp_path):
+    command = [sys.executable, str(EXAMPLES / "robot_loop.py"), "--duration", "400"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert all("holds its start" in process.stdout.readline() for _robot in range(2))
+    os.killpg(process.pid, signal.SIGINT)
+    said = process.communicate(timeout=500)[0]
+    assert process.returncode == 0
+    assert said.count("landed") == 2
 
 
 @pytest.mark.slow

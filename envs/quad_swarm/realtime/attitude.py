@@ -60,6 +60,14 @@ class AttitudeController:
         self.gains, self.yaw = gains or AttitudeGains(), yaw
         self._integral = 0.0
 
+    def reset(self, yaw: float | None = None) -> None:
+        """Forget what the integral has made up for, as before an autopilot begins to fly what it is told.
+
+        :param yaw: heading to hold (rad), by default the one that it holds
+        """
+        self._integral = 0.0
+        self.yaw = self.yaw if yaw is None else yaw
+
     def __call__(self, state: np.ndarray, setpoint: np.ndarray, elapsed: float) -> Attitude:
         """Return what the autopilot is told.
 

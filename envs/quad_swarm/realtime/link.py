@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple, Protocol, TypeVar, cast
 import numpy as np
 from pydantic import Field
 
+from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.robot import Plan, wire
 from quad_swarm.validation import checked
 
@@ -29,6 +30,29 @@ class Sensed(NamedTuple):
     state: np.ndarray
     pos: np.ndarray
     vel: np.ndarray
+
+
+_APART = 200_000  # us between two states from which on the oldest one counts as everybody's
+_S = 1e6
+
+
+def sensed_together(stamp: int, state: np.ndarray, stamps: np.ndarray, pos: np.ndarray, vel: np.ndarray) -> Sensed:
+    """Return what a robot perceives from states of different times, all at the time of its own.
+
+    If one of them is 0.2 s older, all are of that time: guards shall notice that somebody is not seen any more.
+
+    :param stamp: time of the own state (us)
+    :param state: the own state, (9,)
+    :param stamps: times of the others' states (us), (n - 1,)
+    :param pos: positions of the others, (n - 1, 3), world frame (m)
+    :param vel: velocities of the others, (n - 1, 3), world frame (m/s)
+    """
+    oldest = min(stamp, int(np.min(stamps, initial=stamp)))
+    at = stamp if stamp - oldest < _APART else oldest
+    if at != stamp:
+        state = state.copy()
+        state[POSITION] += (at - stamp) / _S * state[VELOCITY]
+    return Sensed(at, state, pos + (at - np.asarray(stamps))[:, None] / _S * vel, vel)
 
 
 class Handler(Protocol):

@@ -27,6 +27,7 @@ from quad_swarm.world.obstacles import Obstacle
 _US = 1e6
 _AHEAD = 0.05  # s by which clocks may differ before a plan comes from the future
 _FEW = 3  # unanswered requests from which on nobody seems to be there
+_TOLD = 5  # times that the vehicle is told to disarm: messages get lost
 _BRAKING = 0.3  # s in which a robot that hovers or lands comes to rest
 
 
@@ -107,6 +108,24 @@ class Loop:
             self.robot.receive(int(self.robot.others[0]), Plan(0, self.robot.newest.positions + pos[0]))
             self.robot.plan()
 
+    def ready(self) -> Sensed:
+        """Return what the robot perceives, if it may take over from whatever let it take off.
+
+        :raises ValueError: if it does not perceive, is on the ground, or if a guard objects
+        """
+        now, limits, sensed = self.link.now(), self.supervisor.limits, self.vehicle.sense()
+        if sensed is None:
+            raise ValueError("no state of each robot has arrived: is their odometry published?")
+        sensed = Sensed(int(sensed.stamp), *self.robot.perceived(*sensed[1:]))
+        if not (age := (now - sensed.stamp) / _US) <= limits.stale:
+            raise ValueError(f"the oldest state is {age:.3f} s old, more than limits.stale={limits.stale:g}")
+        if (height := sensed.state[2]) <= limits.ground:
+            raise ValueError(f"the robot is on the ground ({height:.2f} m high): take off first")
+        guards = Supervisor(self.robot.config, limits, self.robot.index)
+        if guards.check(now, sensed, HOVERING) is not Mode.FLY:
+            raise ValueError(f"the robot would not fly: {', '.join(sorted(guards.why))}")
+        return sensed
+
     def start(
         self,
         start: np.ndarray,
@@ -114,6 +133,7 @@ class Loop:
         first: int,
         obstacles: Sequence[Obstacle] | None = None,
         heading: float = 0.0,
+        begins: int | None = None,
     ) -> None:
         """Begin a flight.
 
@@ -122,6 +142,8 @@ class Loop:
         :param first: start of the first period (us); the others' may differ by part of a period
         :param obstacles: the obstacles, where they are then; by default those that the world lists
         :param heading: heading of the robot, which it keeps (rad)
+        :param begins: when it begins to fly to its goal (us), by default at once. Until then it holds its start, and
+            need not hear from the others
         :raises ValueError: if there are more obstacles than the world has room for
         """
         self.robot.reset(start, goal, self.late, now=first, obstacles=obstacles, initial_heading=heading)
@@ -129,6 +151,9 @@ class Loop:
         self.statistics = Statistics()
         self._forget()
         self._first = self.next_period = first
+        self._begins = first if begins is None else begins
+        if self._begins > first:
+            self.robot.hold = np.array(start, float).reshape(1, 1, 3)
         self._flying = True
         self._began = time.perf_counter(), time.process_time()
 
@@ -147,7 +172,9 @@ class Loop:
         self._sensed: Sensed | None = None
         self._pending: dict[int, int] = {}  # whom it asked in this period, and when
         self._unheard = self._unheard_since = 0  # requests since the last message of anybody
-        self._first = self.next_period = 0
+        self._first = self.next_period = self._begins = 0
+        self._failing_since: int | None = None  # of the planner
+        self._off = 0  # periods since it has landed
         self._last: int | None = None  # start of the last period
         self._tick = self._asked_at = self._computed = 0
         self._plans = False
@@ -173,14 +200,24 @@ class Loop:
         :return: the statistics of the flight
         """
         while not ended():
-            self.link.wait(self.next_period, self)
+            self._wait_until(self.next_period)
             if ended():
                 break
             if self.begin():
-                self.link.wait(self.deadline, self, lambda: not self._pending)
+                self._wait_until(self.deadline, lambda: not self._pending)
             self.finish()
             self._call("report", after_period, self)
         return self.stop()
+
+    def _wait_until(self, until: int, done: Callable[[], bool] = lambda: False) -> None:
+        """Handle messages until some time, also if the link fails."""
+        if not self._call("link", self.link.wait, until, self, done):
+            time.sleep(max(until - self.link.now(), 0) / _US)
+
+    @property
+    def has_landed(self) -> bool:
+        """Whether the robot is down, and its vehicle has been told so often enough."""
+        return self._off >= _TOLD
 
     @property
     def waits(self) -> bool:
@@ -209,7 +246,8 @@ class Loop:
         statistics.durations["jitter"].add(now - tick)
         self._pending = {}
         sensed = self._perceived()
-        mode = self.supervisor.check(now, sensed, self._setpoint, self._unanswered(now))
+        unplanned = 0.0 if self._failing_since is None else (now - self._failing_since) / _US
+        mode = self.supervisor.check(now, sensed, self._setpoint, self._unanswered(now), unplanned)
         self._plans = mode is not Mode.OFF and self.supervisor.sees
         if self._plans and sensed is not None:
             statistics.durations["sensed"].add(tick - sensed.stamp)
@@ -231,13 +269,15 @@ class Loop:
                 setpoint = robot.plan()
                 if not np.isfinite(setpoint).all():
                     raise ValueError(f"the set-point is {setpoint}")
-                plan = robot.newest
+                plan, self._failing_since = robot.newest, None
             except Exception as error:  # of a planner from outside, too
                 self._note("planner", error)
+                self._failing_since = now if self._failing_since is None else self._failing_since
                 setpoint = HOVERING
             if mode is Mode.LAND:  # the planner brakes and evades, but may not want to sink
                 setpoint, plan = np.array([*setpoint[:2], self.supervisor.limits.landing, setpoint[3]]), None
         elif mode is Mode.OFF:
+            self._off += 1
             self._call("vehicle", self.vehicle.disarm)
             return
         else:
@@ -352,13 +392,14 @@ class Loop:
             self.robot.sent(other)
 
     def _aim(self, mode: Mode, sensed: Sensed) -> None:
-        """Fly to the goal, or hold the place where hovering or landing began."""
+        """Fly to the goal, or hold the start, or the place where hovering or landing began."""
         robot = self.robot
         if self._next is not None:
             robot.fly_to(*self._next)
             self._next = None
         if mode is Mode.FLY:
-            robot.hold = None
+            if self._tick >= self._begins:
+                robot.hold = None
             return
         if robot.hold is None:
             robot.hold = (sensed.state[POSITION] + _BRAKING * sensed.state[VELOCITY]).reshape(1, 1, 3)
@@ -369,6 +410,8 @@ class Loop:
 
     def _unanswered(self, now: int) -> float:
         """Return the time without any message in spite of requests (s)."""
+        if now < self._begins:
+            self._unheard = 0
         return (now - self._unheard_since) / _US if self._unheard >= _FEW else 0.0
 
     def _is_teammate(self, sender: int) -> bool:

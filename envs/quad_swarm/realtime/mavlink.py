@@ -17,7 +17,7 @@ import numpy as np
 from quad_swarm.geometry import to_frd, to_ned, to_quaternion
 from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
 from quad_swarm.realtime.attitude import Attitude, AttitudeController
-from quad_swarm.realtime.link import Sensed, monotonic
+from quad_swarm.realtime.link import Sensed, monotonic, sensed_together
 from quad_swarm.robot import Plan
 
 # When positions and velocities of the others were so (us), and these, (n - 1, 3) each
@@ -26,6 +26,9 @@ _OFFBOARD = 6  # PX4's custom main mode
 _CUSTOM = 1  # flag of the base mode
 _IGNORE_RATES = 0b111
 _US = 1e-6
+OFFBOARD_AFTER = 1_500_000  # us of set-points before PX4 is told to fly them: it wants to have had some for a second
+_REBOOTED = 1000  # ms by which the autopilot's time goes back if it was switched on again
+_DRIFT = 2e-4  # by which its clock may be slower
 
 
 class Port(Protocol):
@@ -71,7 +74,11 @@ class UdpPort:
 
 class MavlinkVehicle:
     """A robot's vehicle, see `quad_swarm.realtime.Vehicle`. It needs ``LOCAL_POSITION_NED`` and ``ATTITUDE`` of the
-    autopilot, at the rate of the periods or faster.
+    autopilot, at the rate of the periods or faster. The stamps are those of the autopilot's clock, whose offset is
+    taken from the messages that arrived soonest.
+
+    `arm`, `engage`, and send set-points: it goes offboard after 1.5 s of them. Until it does, the controller forgets
+    what its integral would make up for, and holds the heading that the vehicle has.
 
     :ivar armed: whether the autopilot says that the motors run
     :ivar offboard: whether it says that it flies our set-points
@@ -81,6 +88,7 @@ class MavlinkVehicle:
     :param controller: attitude and thrust for set-points
     :param now: the robot's clock (us)
     :param system: number of the autopilot
+    :param latency: time that a state takes at least from its measurement until it is here (s)
     :raises ImportError: if pymavlink is not installed
     """
 
@@ -91,6 +99,7 @@ class MavlinkVehicle:
         controller: AttitudeController | None = None,
         now: Callable[[], int] = monotonic,
         system: int = 1,
+        latency: float = 0.0,
     ):
         try:
             from pymavlink.dialects.v20 import common
@@ -102,26 +111,34 @@ class MavlinkVehicle:
         self._mav.robust_parsing = True  # bytes that are no message are skipped
         self._system, self._lock = system, threading.RLock()
         self._state = np.zeros(N_STATES)
-        self._moved = self._turned = -1  # when position and attitude arrived
+        self._moved = self._turned = -1  # when position and attitude were so
+        self._latency, self._offset, self._booted = round(latency / _US), 0.0, -1  # of its clock, and its newest time
+        self._offset_at = 0
+        self._offboard_at: int | None = None
         self._commanded = now()
         self.armed = self.offboard = False
 
     def sense(self) -> Sensed | None:
-        """See `Vehicle`. The older of position and attitude counts."""
+        """See `Vehicle`. The older of position and attitude counts, or the others' time if they are 0.2 s older."""
         with self._lock:
             for message in self._mav.parse_buffer(self._port.receive()) or ():
                 self._take(message)
             others = self._others()
             if min(self._moved, self._turned) < 0 or others is None:
                 return None
-            stamp, then = min(self._moved, self._turned), others[0]
             pos, vel = np.asarray(others[1], float), np.asarray(others[2], float)
-            return Sensed(stamp, self._state.copy(), pos + (stamp - then) * _US * vel, vel)
+            stamps = np.full(len(pos), others[0])
+            return sensed_together(min(self._moved, self._turned), self._state.copy(), stamps, pos, vel)
 
     def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
         """See `Vehicle`."""
         with self._lock:
             now = self._now()
+            if self._offboard_at is not None and now >= self._offboard_at:
+                self._offboard_at = None
+                self.begin_offboard()
+            if not self.offboard:
+                self.controller.reset(float(self._state[8]))
             attitude = self.controller(self._state, setpoint, (now - self._commanded) * _US)
             self._commanded = now
             self._send_attitude(attitude)
@@ -133,6 +150,10 @@ class MavlinkVehicle:
     def arm(self) -> None:
         """Ask the autopilot to start the motors."""
         self._command(self._common.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+
+    def engage(self) -> None:
+        """Go offboard after 1.5 s of set-points."""
+        self._offboard_at = self._now() + OFFBOARD_AFTER
 
     def begin_offboard(self) -> None:
         """Ask the autopilot to fly our set-points. PX4 wants to have had some for a second before."""
@@ -146,15 +167,24 @@ class MavlinkVehicle:
             values = np.array([message.x, message.y, message.z, message.vx, message.vy, message.vz])
             if np.isfinite(values).all():
                 self._state[POSITION], self._state[VELOCITY] = to_ned(values[:3]), to_ned(values[3:])
-                self._moved = self._now()
+                self._moved = self._own(message.time_boot_ms)
         elif kind == "ATTITUDE":
             values = np.array([message.roll, message.pitch, message.yaw])
             if np.isfinite(values).all():
                 self._state[6:9] = to_frd(values)
-                self._turned = self._now()
+                self._turned = self._own(message.time_boot_ms)
         elif kind == "HEARTBEAT":
             self.armed = bool(message.base_mode & self._common.MAV_MODE_FLAG_SAFETY_ARMED)
             self.offboard = message.custom_mode >> 16 & 0xFF == _OFFBOARD
+
+    def _own(self, booted: int) -> int:
+        """Return a time of the autopilot's clock (ms) on the robot's (us)."""
+        now = self._now()
+        offset, before = now - 1000 * booted, self._offset + _DRIFT * (now - self._offset_at)
+        is_new = self._booted < 0 or booted < self._booted - _REBOOTED
+        self._offset = offset if is_new else min(offset, before)
+        self._booted, self._offset_at = booted if is_new else max(booted, self._booted), now
+        return round(1000 * booted + self._offset) - self._latency
 
     def _send_attitude(self, attitude: Attitude) -> None:
         q = np.roll(to_quaternion(to_frd(np.array(attitude[:3]))), 1).tolist()  # w comes first

@@ -37,7 +37,8 @@ class SafetyLimits:
     """When a robot hovers, and when it lands. Times are in seconds, lengths in metres.
 
     :param stale: age of the perceived state from which on it hovers
-    :param lost: age of the perceived state from which on it lands; also for a state that is frozen
+    :param lost: age of the perceived state from which on it lands; also for a state that is frozen, and a planner that
+        fails
     :param frozen: time after which a state that stays the same to the last bit is none, unless the robot is at rest
     :param unanswered: time without any message in spite of requests after which the robot hovers, and asks everybody
     :param silence: the same, after which it lands
@@ -47,8 +48,9 @@ class SafetyLimits:
     :param hung: time without a sign of life of the loop after which the watchdog hovers
     :param landing: climb rate of a landing (m/s), negative. Where the planner's limit of descents is lower, robots land
         with that, and may take longer in proportion
-    :param ground: height at which it has landed
-    :param landing_time: longest duration of a landing
+    :param ground: height at which it has landed; a robot that sees itself above it does not disarm
+    :param settled: time at that height, or below, after which it disarms
+    :param landing_time: duration of a landing without a state, if its last height does not take longer
     :raises ValueError: if a value is out of range, or a state would be lost before it is stale
     """
 
@@ -62,6 +64,7 @@ class SafetyLimits:
     hung: PositiveFloat = 0.3
     landing: Annotated[float, Field(lt=0, ge=-2)] = -0.5
     ground: float = 0.1
+    settled: PositiveFloat = 0.3
     landing_time: PositiveFloat = 20.0
 
     def __post_init__(self) -> None:
@@ -97,7 +100,7 @@ class Supervisor:
         self._apart = contact if limits.separation is None else limits.separation
         low, high = np.array(config.planner.workspace_low), np.array(config.planner.workspace_high)
         self._low, self._high = low - limits.fence, high + limits.fence
-        self._low[2] = -np.inf
+        self._low[2], self._highest = -np.inf, high[2]
         self.reasons: Counter[str] = Counter()
         self.reset()
 
@@ -106,19 +109,30 @@ class Supervisor:
         self.mode, self.why, self.sees = Mode.FLY, frozenset[str](), False
         self._state: np.ndarray | None = None
         self._changed = self._landing_since = 0
+        self._height = self._highest  # where it was seen last
+        self._low_since: int | None = None  # since when it has been seen on the ground (us)
+        self._low_for = 0.0  # and for how long (s)
         self._is_frozen = self.shall_land = False
 
     def land(self) -> None:
         """Land from the next check on, since somebody outside wishes so. This is final, as every landing is."""
         self.shall_land = True
 
-    def check(self, now: int, sensed: Sensed | None, setpoint: np.ndarray, unanswered: float = 0.0) -> Mode:
+    def check(
+        self,
+        now: int,
+        sensed: Sensed | None,
+        setpoint: np.ndarray,
+        unanswered: float = 0.0,
+        unplanned: float = 0.0,
+    ) -> Mode:
         """Check everything once a period.
 
         :param now: the time (us)
         :param sensed: what is perceived; None before there is anything
         :param setpoint: the last set-point, (4,)
         :param unanswered: time without any message in spite of requests (s)
+        :param unplanned: time since which the planner has failed (s)
         """
         if self.mode is Mode.OFF:
             return self.mode
@@ -127,27 +141,36 @@ class Supervisor:
             why["told to land"] = Mode.LAND
         if sensed is None:
             why["no state yet"] = Mode.HOVER
-        elif (age := (now - sensed.stamp) / _US) > limits.stale:
-            why["state is stale"] = Mode.LAND if age > limits.lost else Mode.HOVER
-        if sensed is not None:
-            same = self._unchanged(sensed, setpoint)
-            if self._is_frozen:
-                why["state is frozen"] = Mode.LAND if same > limits.lost else Mode.HOVER
-            own = sensed.state[POSITION]
-            if (own < self._low).any() or (own > self._high).any():
-                why["outside the fence"] = Mode.LAND
-            if len(sensed.pos) and (np.linalg.norm(sensed.pos - own, axis=1) - self._excess).min() < self._apart:
-                why["too close"] = Mode.HOVER
+        else:
+            why |= self._objections(now, sensed, setpoint)
         if unanswered > limits.unanswered:
             why["no answers"] = Mode.LAND if unanswered > limits.silence else Mode.HOVER
+        if unplanned > limits.lost:
+            why["planner fails"] = Mode.LAND
         self.sees = why.keys().isdisjoint(("no state yet", "state is stale", "state is frozen"))
         self.reasons.update(why.keys() - self.why)
         self.why = frozenset(why)
         mode = max(why.values(), default=Mode.FLY)
+        if self.sees and sensed is not None:
+            self._look_down(sensed)
         if self.mode is Mode.LAND or mode is Mode.LAND:
-            mode = self._land(now, sensed)
+            mode = self._land(now)
         self.mode = mode
         return mode
+
+    def _objections(self, now: int, sensed: Sensed, setpoint: np.ndarray) -> dict[str, Mode]:
+        """Return the guards that object to a state."""
+        limits, why, own = self.limits, dict[str, Mode](), sensed.state[POSITION]
+        if (age := (now - sensed.stamp) / _US) > limits.stale:
+            why["state is stale"] = Mode.LAND if age > limits.lost else Mode.HOVER
+        same = self._unchanged(sensed, setpoint)
+        if self._is_frozen:
+            why["state is frozen"] = Mode.LAND if same > limits.lost else Mode.HOVER
+        if (own < self._low).any() or (own > self._high).any():
+            why["outside the fence"] = Mode.LAND
+        if len(sensed.pos) and (np.linalg.norm(sensed.pos - own, axis=1) - self._excess).min() < self._apart:
+            why["too close"] = Mode.HOVER
+        return why
 
     def _unchanged(self, sensed: Sensed, setpoint: np.ndarray) -> float:
         """Return how long the state has been the same (s)."""
@@ -159,12 +182,25 @@ class Supervisor:
         self._is_frozen |= same > self.limits.frozen and not at_rest
         return same
 
-    def _land(self, now: int, sensed: Sensed | None) -> Mode:
+    def _look_down(self, sensed: Sensed) -> None:
+        """Note the height, and how long the robot has been on the ground: a single low state may be an error."""
+        self._height = float(sensed.state[2])
+        if self._height > self.limits.ground:
+            self._low_since = None
+        elif self._low_since is None:
+            self._low_since = sensed.stamp
+        self._low_for = 0.0 if self._low_since is None else (sensed.stamp - self._low_since) / _US
+
+    def _land(self, now: int) -> Mode:
+        limits = self.limits
         if self.mode is not Mode.LAND:
             self._landing_since = now
-        is_down = self.sees and sensed is not None and sensed.state[2] <= self.limits.ground
-        timed_out = now - self._landing_since > self.limits.landing_time * _US
-        return Mode.OFF if is_down or timed_out else Mode.LAND
+        if self.sees:
+            is_down = self._low_for >= limits.settled
+        else:
+            descent = 2 * (self._height - limits.ground) / -limits.landing
+            is_down = now - self._landing_since > max(limits.landing_time, descent) * _US
+        return Mode.OFF if is_down else Mode.LAND
 
     def setpoint(self, mode: Mode) -> np.ndarray:
         """Return the set-point of a robot that does not plan, (4,).

@@ -44,7 +44,7 @@ from quad_swarm.realtime.attitude import AttitudeController, AttitudeGains
 from quad_swarm.realtime.link import Handler, monotonic
 from quad_swarm.realtime.loop import Loop, freeze_garbage, thaw_garbage
 from quad_swarm.realtime.process import prepare
-from quad_swarm.realtime.supervisor import HOVERING, Mode, SafetyLimits, Supervisor
+from quad_swarm.realtime.supervisor import Mode, SafetyLimits
 from quad_swarm.realtime.team import Team
 from quad_swarm.ros.link import RosLink
 from quad_swarm.ros.messages import FRAME, msgs, to_diagnostics
@@ -96,7 +96,6 @@ PARAMETERS: dict[str, Any] = {
 }
 _IDLE = 100_000  # us after which a node without a flight looks around
 _STATUS = 1_000_000  # us
-_DISARMS = 5  # times that the vehicle is told so: messages get lost
 
 
 def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[str, Any], period: int) -> TeamVehicle:
@@ -157,7 +156,7 @@ class RobotNode:
         self.flies = self._ended = self._leaves = self._is_fresh = self._is_active = False
         self._starts, self._refused = self.node.get_parameter("autostart").value is True, ""
         self._own: list[tuple[Callable[[Any], Any], Any]] = []
-        self._off, self._told, self._mode = 0, 0, Mode.OFF
+        self._told, self._mode = 0, Mode.OFF
 
     def run(self) -> None:
         """Run until `end` or the transition ``shutdown``."""
@@ -166,7 +165,7 @@ class RobotNode:
         while not self._ended:
             loop = self.loop
             if loop is not None and self.flies:
-                loop.run(self._is_down, self._after_period)
+                loop.run(self._has_landed, self._after_period)
                 self._watchdog.beat(armed=False)
                 self.flies = False
                 self._log(f"landed ({loop.statistics.counts['periods']} periods flown)")
@@ -219,26 +218,14 @@ class RobotNode:
         :raises ValueError: if the robot must not begin to fly
         """
         loop = self._grounded()
-        now, sensed, limits = loop.link.now(), loop.vehicle.sense(), loop.supervisor.limits
-        if sensed is None:
-            raise ValueError("no state of each robot has arrived: is their odometry published?")
-        age = (now - sensed.stamp) * 1e-6
-        if not age <= limits.stale:
-            raise ValueError(f"the oldest state is {age:.3f} s old, more than limits.stale={limits.stale:g}")
-        own = sensed.state[POSITION].copy()
-        if not np.isfinite(own).all():
-            raise ValueError("the own state is not finite")
-        if own[2] <= limits.ground:
-            raise ValueError(f"the robot is on the ground ({own[2]:.2f} m high): take off first")
-        guards = Supervisor(loop.robot.config, limits, loop.robot.index)
-        if guards.check(now, sensed, HOVERING) is not Mode.FLY:
-            raise ValueError(f"the robot would not fly: {', '.join(sorted(guards.why))}")
+        sensed = loop.ready()
         if absent := self._link.absent():
             raise ValueError(f"{absent[0]} does not listen: configure all robots first")
-        goal, first = own if self._goal is None else self._goal, now + loop.robot.period
+        own = sensed.state[POSITION].copy()
+        goal, first = own if self._goal is None else self._goal, loop.link.now() + loop.robot.period
         loop.start(own, goal, first, heading=float(sensed.state[8]))
         self._vehicle.engage()
-        self._off, self._mode = 0, Mode.FLY
+        self._mode = Mode.FLY
         self.flies = self._is_active = True
         self._starts = False
 
@@ -329,13 +316,12 @@ class RobotNode:
         self._is_fresh = False
         thaw_garbage()
 
-    def _is_down(self) -> bool:
-        return self._off >= _DISARMS
+    def _has_landed(self) -> bool:
+        return self.loop is not None and self.loop.has_landed
 
     def _after_period(self, loop: Loop) -> None:
         mode = loop.supervisor.mode
         self._watchdog.beat(armed=mode is not Mode.OFF)  # motors that have stopped shall not start again
-        self._off += mode is Mode.OFF
         if mode is not self._mode:
             self._mode = mode
             self._log(f"{mode.name.lower()}: {', '.join(sorted(loop.supervisor.why)) or 'all is well'}")

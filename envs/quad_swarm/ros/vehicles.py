@@ -29,17 +29,16 @@ import numpy as np
 from quad_swarm.geometry import from_quaternion, to_frd, to_ned, to_quaternion, wrapped
 from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
 from quad_swarm.realtime.attitude import Attitude, AttitudeController
-from quad_swarm.realtime.link import Sensed
+from quad_swarm.realtime.link import Sensed, sensed_together
+from quad_swarm.realtime.mavlink import OFFBOARD_AFTER
 from quad_swarm.robot import Plan
 from quad_swarm.ros.link import RosLink
 from quad_swarm.ros.messages import FRAME, from_odometry, msgs, rotation, to_command, to_time
 from quad_swarm.ros.node import Mailbox, quality
 
-_STALE = 200_000  # us between two robots' states from which on the older one counts as everybody's
 _S = 1_000_000
 _CRAZYFLIE_THRUST, _CRAZYFLIE_MOST = 65535, 60000
 _PX4_NED, _PX4_BODY_FRD = 1, 3
-_OFFBOARD = 1_500_000  # us of set-points before PX4 is told to fly them
 _PX4_SET_MODE, _PX4_ARM, _PX4_OFFBOARD = 176, 400, 6
 
 
@@ -84,16 +83,13 @@ class TeamVehicle:
         if len(states) < len(self._others) + 1:
             return None
         stamp, own = states[self._link.index]
-        oldest = min(one for one, _ in states.values())
-        pos, vel = np.empty((len(self._others), 3)), np.empty((len(self._others), 3))
-        for place, other in enumerate(self._others):
-            then, state = states[other]
-            vel[place] = state[VELOCITY]
-            pos[place] = state[POSITION] + (stamp - then) / _S * vel[place]
-        return Sensed(stamp if stamp - oldest < _STALE else oldest, own, pos, vel)
+        stamps, others = zip(*(states[other] for other in self._others), strict=True)
+        seen = np.array(others)
+        return sensed_together(stamp, own, np.array(stamps), seen[:, POSITION], seen[:, VELOCITY])
 
     def engage(self) -> None:
         """Prepare for set-points: a flight begins."""
+        self.controller.reset()
 
     def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
         """See `quad_swarm.realtime.Vehicle`."""
@@ -327,12 +323,14 @@ class Px4Vehicle(TeamVehicle):
 
     def engage(self) -> None:
         """Go offboard after 1.5 s of set-points: PX4 wants to have had some for a second before."""
-        self._offboard_at = self._link.now() + _OFFBOARD
+        super().engage()
+        self._offboard_at = self._link.now() + OFFBOARD_AFTER
 
     def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
         """See `quad_swarm.realtime.Vehicle`."""
         if self._offboard_at is not None and self._link.now() >= self._offboard_at:
             self._offboard_at = None
+            self.controller.reset()  # nobody flew what it was told so far
             self.begin_offboard()
         mode, attitudes, _ = self._kinds
         attitude, stamp = self._attitude(setpoint), self._stamp()

@@ -48,6 +48,17 @@ def test_the_integral_is_bounded_on_the_ground():
     assert controller(LEVEL, np.zeros(4), 0.05).thrust == pytest.approx(0.5 * 1.3)
 
 
+def test_what_the_integral_made_up_for_is_forgotten_before_a_flight():
+    controller = AttitudeController(yaw=1.0)
+    for _ in range(100):
+        controller(LEVEL, np.array([0, 0, 1.0, 0.1]), 0.05)
+    yaw = controller.yaw
+    controller.reset()
+    assert controller(LEVEL, np.zeros(4), 0.05) == pytest.approx((0, 0, yaw, 0.5))
+    controller.reset(-2.0)
+    assert controller.yaw == -2.0
+
+
 def test_the_heading_is_held_and_turned():
     controller = AttitudeController(yaw=3.0)
     turned = LEVEL.copy()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from quad_swarm.realtime import Channel, Conditions, WireLink
-from quad_swarm.realtime.link import Traffic
+from quad_swarm.realtime.link import Traffic, sensed_together
 from quad_swarm.robot import Plan, wire
 
 PLAN = Plan(1_000_000, np.arange(21)[:, None] * np.array([0.1, 0.05, 0.0]))
@@ -105,3 +105,15 @@ def test_reordered_messages_arrive_after_the_next_one():
 def test_shares_are_shares(conditions):
     with pytest.raises(ValueError, match=next(iter(conditions))):
         Conditions(**conditions)
+
+
+@pytest.mark.parametrize(("stamps", "at"), [([900_000, 1_100_000], 1_000_000), ([700_000, 990_000], 700_000)])
+def test_states_of_different_times_become_those_of_one_time(stamps, at):
+    """Of the own one, or of one that is so much older that the guards shall see it."""
+    state = np.array([1.0, 0, 1.5, 2.0, 0, 0, 0.1, 0, 0])
+    pos, vel = np.zeros((2, 3)), np.array([[0, 1.0, 0], [0, -1.0, 0]])
+    sensed = sensed_together(1_000_000, state, np.array(stamps), pos, vel)
+    assert sensed.stamp == at
+    np.testing.assert_allclose(sensed.state, [1.0 + 2 * (at - 1_000_000) * 1e-6, *state[1:]])
+    np.testing.assert_allclose(sensed.pos[:, 1], (at - np.array(stamps)) * 1e-6 * [1, -1], atol=1e-12)
+    assert state[0] == 1.0

@@ -276,9 +276,91 @@ def test_after_landing_the_motors_stop():
     vehicle.state[0] = 50.0
     assert periods(loop, 2) == [Mode.LAND] * 2
     vehicle.state[2] = 0.0
-    assert periods(loop, 2) == [Mode.OFF] * 2
-    assert vehicle.disarmed == 2
-    assert len(vehicle.commands) == 2
+    assert periods(loop, 6) == [Mode.LAND] * 6
+    assert periods(loop, 4) == [Mode.OFF] * 4
+    assert not loop.has_landed
+    periods(loop, 1)
+    assert loop.has_landed
+    assert vehicle.disarmed == 5
+    assert len(vehicle.commands) == 8
+
+
+def test_until_all_begin_it_holds_its_start_and_needs_nobody():
+    loop, link, vehicle = make("full")
+    start = np.array([0, 0, 1.5])
+    loop.start(start, np.array([3.0, 0, 1.5]), 0, begins=15 * 1_000_000)
+    assert periods(loop, 300) == [Mode.FLY] * 300
+    np.testing.assert_array_equal(loop.robot.goal[0, 0], start)
+    assert np.abs(vehicle.commands[-1][1]).max() < 1e-3
+    assert link.requests, "and hears them if they are there"
+    periods(loop, 1)
+    np.testing.assert_array_equal(loop.robot.goal[0, 0], [3.0, 0, 1.5])
+    assert vehicle.commands[-1][1][1] > 0.05
+    assert Mode.HOVER in periods(loop, 25), "from then on, silence counts"
+
+
+def test_a_robot_that_waits_can_be_told_to_land():
+    loop, _link, vehicle = make("none")
+    loop.start(np.array([0, 0, 1.5]), np.array([3.0, 0, 1.5]), 0, begins=10**9)
+    periods(loop, 2)
+    loop.supervisor.land()
+    assert periods(loop, 1) == [Mode.LAND]
+    assert vehicle.commands[-1][1][2] == -0.5
+
+
+NOT_READY = {
+    "no state of each robot": lambda now, state: None,
+    "0.300 s old": lambda now, state: Sensed(now - 300_000, state, OTHERS, 0 * OTHERS),
+    "on the ground": lambda now, state: Sensed(now, state * [1, 1, 0, 1, 1, 1, 1, 1, 1], OTHERS, 0 * OTHERS),
+    "finite": lambda now, state: Sensed(now, state * np.nan, OTHERS, 0 * OTHERS),
+    "too close": lambda now, state: Sensed(now, state, OTHERS * 0 + [0.1, 0, 1.5], 0 * OTHERS),
+}
+
+
+@pytest.mark.parametrize("reason", NOT_READY)
+def test_who_must_not_take_over_is_told_why(reason):
+    loop, link, vehicle = make()
+    assert loop.ready().state[2] == pytest.approx(1.5)
+    vehicle.perceived = lambda: NOT_READY[reason](link.time, vehicle.state)
+    with pytest.raises(ValueError, match=reason):
+        loop.ready()
+
+
+def test_a_planner_that_fails_for_good_lands():
+    loop, _link, vehicle = make("none")
+    periods(loop, 1)
+    plan, loop.robot.plan = loop.robot.plan, lambda: 1 / 0
+    assert periods(loop, 21) == [Mode.FLY] * 21
+    assert vehicle.commands[-1][1].tolist() == [0, 0, 0, 0]
+    assert periods(loop, 2)[-1] is Mode.LAND
+    assert vehicle.commands[-1][1].tolist() == [0, 0, -0.5, 0]
+    loop.robot.plan = plan
+    assert periods(loop, 1) == [Mode.LAND]
+
+
+def test_a_planner_that_fails_at_times_flies():
+    loop, _link, _vehicle = make("none")
+    periods(loop, 1)
+    plan = loop.robot.plan
+    for _ in range(3):
+        loop.robot.plan = lambda: 1 / 0
+        periods(loop, 15)
+        loop.robot.plan = plan
+        assert periods(loop, 1) == [Mode.FLY]
+
+
+def test_a_link_that_cannot_wait_does_not_end_the_flight():
+    loop, link, vehicle = make("full")
+
+    def wait(until, handler, done=lambda: False):
+        link.time = max(link.time, until)
+        raise OSError("no network")
+
+    link.wait = wait
+    statistics = loop.run(lambda: link.time >= 4 * PERIOD)
+    assert statistics.counts["periods"] == 4
+    assert statistics.counts["errors: link"] >= 4
+    assert len(vehicle.commands) == 4
 
 
 def test_errors_of_policies_planners_links_and_vehicles_do_not_end_the_loop():

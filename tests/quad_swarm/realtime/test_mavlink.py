@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quad_swarm.geometry import to_frd, to_ned
-from quad_swarm.realtime import Loop, SafetyLimits
+from quad_swarm.realtime import Loop, Mode, SafetyLimits
 from quad_swarm.realtime.attitude import GRAVITY, AttitudeController, AttitudeGains
 from quad_swarm.realtime.mavlink import MavlinkVehicle, UdpPort
 from quad_swarm.robot import Robot, RulePolicy
@@ -163,8 +163,62 @@ def test_the_older_of_position_and_attitude_counts():
     autopilot.step()
     assert vehicle.sense().stamp == STEP
     autopilot.time += 300_000
-    autopilot.sent = autopilot.mav.attitude_encode(0, 0, 0, 0, 0, 0, 0).pack(autopilot.mav)
+    autopilot.sent = autopilot.mav.attitude_encode(310, 0, 0, 0, 0, 0, 0).pack(autopilot.mav)
     assert vehicle.sense().stamp == STEP, "no position came"
+
+
+def test_a_state_is_as_old_as_its_measurement():
+    """By the autopilot's clock, whose offset is that of the messages that took the shortest time."""
+    autopilot, vehicle, _ = flying()
+    booted = 7_000  # ms later than the robot's clock
+
+    def arrive(measured, arrived):
+        autopilot.time = arrived
+        for message in (
+            autopilot.mav.local_position_ned_encode(measured // 1000 + booted, 0, 0, -1.5, 0, 0, 0),
+            autopilot.mav.attitude_encode(measured // 1000 + booted, 0, 0, 0, 0, 0, 0),
+        ):
+            autopilot.sent += message.pack(autopilot.mav)
+        return vehicle.sense().stamp
+
+    assert arrive(10_000, 15_000) == 15_000
+    assert arrive(20_000, 40_000) == pytest.approx(25_000, abs=10)
+    assert arrive(30_000, 30_000) == 30_000
+    assert arrive(400_000, 600_000) == pytest.approx(400_000, abs=200), "as after a link that was stuck"
+    booted = 0  # it was switched on again
+    assert arrive(700_000, 702_000) == 702_000
+    later = MavlinkVehicle(autopilot, lambda: (0, FAR, np.zeros((1, 3))), now=lambda: autopilot.time, latency=0.02)
+    vehicle = later
+    assert arrive(800_000, 800_000) == 0, "nobody has seen the others since"
+    later._others = lambda: (800_000, FAR, np.zeros((1, 3)))
+    assert arrive(810_000, 810_000) == 790_000
+
+
+def test_it_goes_offboard_after_some_set_points_with_the_heading_it_has():
+    autopilot, vehicle, loop = flying(1.0)
+    vehicle.controller.yaw = 0.0
+    vehicle.arm()
+    vehicle.engage()
+    fly(loop, 1_400_000)
+    assert not autopilot.offboard
+    fly(loop, 6_000_000)
+    assert autopilot.offboard
+    assert to_frd(autopilot.attitude)[2] == pytest.approx(1.0, abs=0.02)
+
+
+def test_neighbours_that_nobody_sees_any_more_make_it_land():
+    autopilot, vehicle, loop = flying()
+    seen = FAR.copy()
+    vehicle._others = lambda: (min(autopilot.time, 1_000_000), seen, np.ones((1, 3)))
+    fly(loop, 1_000_000)
+    assert loop.supervisor.mode is Mode.FLY
+    fly(loop, 1_400_000)
+    assert loop.supervisor.mode is Mode.HOVER
+    sensed = vehicle.sense()
+    assert sensed.stamp == 1_000_000
+    np.testing.assert_allclose(sensed.pos, seen, err_msg="where they were then")
+    fly(loop, 2_500_000)
+    assert loop.supervisor.mode is Mode.LAND
 
 
 def test_where_nobody_sees_the_others_nothing_is_perceived():

@@ -70,8 +70,8 @@ def test_landing_is_final_and_ends_on_the_ground():
     supervisor = Supervisor(CONFIG, SafetyLimits())
     high = CONFIG.planner.workspace_high
     out = (high[0] + 1.1, 0.0, 1.5)
-    flight = [sensed, lambda now: sensed(now, out), sensed, sensed, lambda now: sensed(now, (0, 0, 0.05)), sensed]
-    assert modes(supervisor, flight) == [Mode.FLY, Mode.LAND, Mode.LAND, Mode.LAND, Mode.OFF, Mode.OFF]
+    flight = [sensed, lambda now: sensed(now, out), sensed, *[lambda now: sensed(now, (0, 0, 0.05))] * 7, *[sensed] * 2]
+    assert modes(supervisor, flight) == [Mode.FLY] + [Mode.LAND] * 8 + [Mode.OFF] * 3
     assert supervisor.reasons == {"outside the fence": 1}
     assert supervisor.setpoint(Mode.LAND).tolist() == [0, 0, -0.5, 0]
     supervisor.reset()
@@ -87,12 +87,36 @@ def test_a_landing_obeys_the_planner_s_limit_and_may_take_longer():
     assert Supervisor(fast, SafetyLimits()).limits == SafetyLimits()
 
 
-def test_a_landing_without_a_state_ends_some_time():
+@pytest.mark.parametrize(("height", "seconds"), [(0.2, 1.0), (1.5, 2 * 1.4 / 0.5)])
+def test_a_landing_without_a_state_takes_twice_the_time_of_the_descent(height, seconds):
     supervisor = Supervisor(CONFIG, SafetyLimits(landing_time=1.0))
-    last = sensed(0)
-    flown = modes(supervisor, [lambda now: last] * 50)
-    assert flown.count(Mode.LAND) == 21
+    last = sensed(0, (0, 0, height))
+    flown = modes(supervisor, [lambda now: last] * 150)
+    assert flown.count(Mode.LAND) == pytest.approx(seconds * 20, abs=1)
     assert flown[-1] is Mode.OFF
+
+
+def test_a_landing_of_a_robot_that_was_never_seen_takes_that_of_the_whole_room():
+    supervisor = Supervisor(CONFIG, SafetyLimits(landing_time=1.0))
+    supervisor.land()
+    seconds = 2 * (CONFIG.planner.workspace_high[2] - 0.1) / 0.5
+    assert modes(supervisor, [None] * 600).count(Mode.LAND) == pytest.approx(seconds * 20, abs=1)
+
+
+def test_a_robot_that_sees_itself_in_the_air_does_not_disarm():
+    """Neither after the time of a landing nor by a single low state."""
+    supervisor = Supervisor(CONFIG, SafetyLimits(landing_time=1.0))
+    supervisor.land()
+    low = [lambda now: sensed(now, (0, 0, 0.05))]
+    assert modes(supervisor, [*[sensed] * 60, *low * 4, sensed, *low * 4, sensed]) == [Mode.LAND] * 70
+
+
+def test_a_planner_that_fails_makes_it_land():
+    supervisor = Supervisor(CONFIG, SafetyLimits())
+    assert supervisor.check(0, sensed(0), np.zeros(4), unplanned=0.9) is Mode.FLY
+    assert supervisor.check(PERIOD, sensed(PERIOD), np.zeros(4), unplanned=1.1) is Mode.LAND
+    assert supervisor.why == {"planner fails"}
+    assert supervisor.sees
 
 
 def test_a_robot_lands_if_somebody_wishes_so():
@@ -102,7 +126,7 @@ def test_a_robot_lands_if_somebody_wishes_so():
     supervisor.land()
     assert modes(supervisor, [sensed] * 2) == [Mode.LAND] * 2
     assert supervisor.why == {"told to land"}
-    assert modes(supervisor, [lambda now: sensed(now, (0, 0, 0.05))] * 2) == [Mode.OFF] * 2
+    assert modes(supervisor, [lambda now: sensed(now, (0, 0, 0.05))] * 8) == [Mode.LAND] * 6 + [Mode.OFF] * 2
     assert supervisor.reasons == {"told to land": 1}
     supervisor.reset()
     assert modes(supervisor, [sensed]) == [Mode.FLY], "the wish was that of the last flight"
