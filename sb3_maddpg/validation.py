@@ -62,7 +62,7 @@ class RunArguments(Arguments):
 
     replay_buffer_kwargs: dict[str, Any] | None = Field(description="a dict of arguments by name, or None")
     policy_kwargs: dict[str, Any] | None = Field(description="a dict of arguments by name, or None")
-    stats_window_size: int = Field(ge=1, le=10**9, description="a number of episodes, at least 1")
+    stats_window_size: int = Field(ge=1, le=10**9, description="a whole number of episodes, at least 1")
     tensorboard_log: str | Path | None = Field(description="a folder, or None")
     verbose: NaturalOrZero = Field(description="0, 1 or 2")
     seed: int | None = Field(ge=0, lt=2**32, description="an integer from 0 to 2**32 - 1, or None")
@@ -78,7 +78,7 @@ class LearnArguments(Arguments):
     callback: InstanceOf[BaseCallback] | list[InstanceOf[BaseCallback]] | Callable[..., Any] | None = Field(
         description="a callback of Stable-Baselines3, a list of them, a function (not a class), or None"
     )
-    log_interval: Natural | None = Field(description="a number of episodes, at least 1, or None")
+    log_interval: Natural | None = Field(description="a whole number of episodes, at least 1, or None")
 
     @field_validator("callback")
     @classmethod
@@ -99,9 +99,9 @@ class TeamArguments(Arguments):
 
     # 0 is allowed, because rl_zoo3 loads models with it to render them
     learning_rate: AtLeastZero | Schedule = Field(description="a finite number that is not negative, or a schedule")
-    buffer_size: Natural = Field(description="a number of transitions, at least 1")
-    learning_starts: NaturalOrZero = Field(description="a number of steps, at least 0")
-    batch_size: Natural = Field(description="a number of transitions, at least 1")
+    buffer_size: Natural = Field(description="a whole number of transitions, at least 1")
+    learning_starts: NaturalOrZero = Field(description="a whole number of steps, at least 0")
+    batch_size: Natural = Field(description="a whole number of transitions, at least 1")
     tau: float = Field(gt=0, le=1, description="a number above 0 and up to 1")
     gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
     train_freq: (
@@ -110,11 +110,11 @@ class TeamArguments(Arguments):
         | tuple[Natural, Literal["step", "episode"]]
     ) = Field(description='an integer of at least 1, or such a number with its unit, (1, "step") or (1, "episode")')
     gradient_steps: Annotated[int, Field(ge=-1, lt=LARGEST)] = Field(
-        description="a number of steps, or -1 for as many as environment steps"
+        description="a whole number of steps, or -1 for as many as environment steps"
     )
     action_noise: InstanceOf[ActionNoise] | None = Field(description="an ActionNoise of Stable-Baselines3, or None")
     optimize_memory_usage: bool = Field(description="True or False")
-    n_steps: Natural = Field(description="a number of steps of at least 1")
+    n_steps: Natural = Field(description="a whole number of steps, at least 1")
     use_action_cost: bool = Field(description="True or False")
     max_grad_norm: Positive | None = Field(description="positive, or None for no limit")
 
@@ -261,7 +261,7 @@ class CurriculumArguments(Arguments):
     """Arguments of ``CurriculumCallback``."""
 
     success_threshold: float = Field(gt=0, le=1, description="a fraction of episodes above 0 and up to 1")
-    window: Natural = Field(description="a number of episodes, at least 1")
+    window: Natural = Field(description="a whole number of episodes, at least 1")
 
 
 class PairPolicyArguments(Arguments):

@@ -10,6 +10,7 @@ from contextlib import suppress
 import gymnasium
 
 from sb3_maddpg.team.pettingzoo import ENTRY_POINT, find_module, find_parallel_env, make
+from sb3_maddpg.utils import did_you_mean
 
 
 def register(env_id: str) -> bool:
@@ -51,6 +52,16 @@ def siblings(env_id: str) -> list[str]:
         return []
     paths = getattr(find_module(package), "__path__", [])
     return [f"{package}/{found.name}" for found in pkgutil.iter_modules(paths) if re.search(r"_v\d+$", found.name)]
+
+
+def similar(env_id: str) -> str:
+    """
+    :param env_id: an id that neither Gymnasium nor ``register`` knows
+    :return: a question about the id that was perhaps meant, to append to a message; empty if there is none
+    """
+    module = env_id.rpartition("/")[2]
+    known = packaged(module) if module.isidentifier() else []
+    return did_you_mean(env_id, known, 0.3) or did_you_mean(env_id, siblings(env_id) or gymnasium.registry)
 
 
 def packaged(module: str) -> list[str]:

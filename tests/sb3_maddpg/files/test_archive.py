@@ -72,9 +72,9 @@ def test_what_is_no_zip_file_is_refused(content):
 
 def test_a_missing_file_is_told_with_a_similar_one(tmp_path):
     (tmp_path / "best_model.zip").touch()
-    with pytest.raises(FileNotFoundError, match=r"no such model file from .* mean 'best_model.zip'\?: '.*bset_model"):
+    with pytest.raises(FileNotFoundError, match=r"no such model file. Did you mean 'best_model.zip'\?: '.*bset_model"):
         MADDPG.load(tmp_path / "bset_model")
-    with pytest.raises(FileNotFoundError, match=r"no such model file from /[^?]*\.: 'elsewhere/a.zip'$"):
+    with pytest.raises(FileNotFoundError, match=r"no such model file \(in the folder /[^?]*\): 'elsewhere/a.zip'$"):
         MADDPG.load("elsewhere/a.zip")
 
 
