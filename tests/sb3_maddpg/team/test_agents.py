@@ -162,11 +162,8 @@ def test_flat_observations_are_numbers():
 def test_an_environment_is_named_or_created():
     model = MADDPG("MlpPolicy", "mpe2/simple_spread_v3", **SMALL)
     assert model.env.num_envs == 1
-    with pytest.raises(
-        ValueError, match=r"no environment 'mpe2/simple_sprad_v3'. Did you mean 'mpe2/simple_spread_v3'\?$"
-    ):
+    meant = r"no environment '{}'. Did you mean 'mpe2/simple_spread_v3'\?$"
+    with pytest.raises(ValueError, match=meant.format("mpe2/simple_sprad_v3")):
         MADDPG("MlpPolicy", "mpe2/simple_sprad_v3")
-    with pytest.raises(
-        ValueError, match=r"no environment 'mpe/simple_spread_v3'. Did you mean 'mpe2/simple_spread_v3'\?$"
-    ):
+    with pytest.raises(ValueError, match=meant.format("mpe/simple_spread_v3")):
         make_vec_env("mpe/simple_spread_v3")
