@@ -48,6 +48,7 @@ MODULES = {
 }
 ENVS = (*MODULES, "simple_spread:discrete")
 ALGOS: dict[str, type[TeamAlgorithm]] = {"maddpg": MADDPG, "matd3": MATD3, "masac": MASAC, "iddpg": IDDPG}
+OPPONENTS = {MODULES["simple_tag"], MODULES["simple_adversary"]}
 EVAL_FREQ, EVAL_EPISODES = 10_000, 100
 SHOWN = (50_000, 100_000)
 # Mean returns that an implementation should reach, slightly worse than those of XuanCe and a plain PyTorch loop
@@ -243,27 +244,30 @@ def random_return(env: str, actions: str) -> float:
 
 def plot(rows: Sequence[Row], file: Path) -> None:
     """Draw the learning curves with 95 % t-intervals and the return of random actions, with a panel for each
-    environment and kind of actions."""
-    groups = grouped(rows)
+    environment and kind of actions; not those of opponents, whose mean says nothing."""
+    groups = grouped(row for row in rows if row["env"] not in OPPONENTS)
     kinds = list(dict.fromkeys((env, actions) for env, actions, _ in groups))
-    algos = list(dict.fromkeys(algo for _, _, algo in groups))
+    algos = [algo for algo in (*ALGOS, "ppo") if any(group[2] == algo for group in groups)]
     height = math.ceil(len(kinds) / 2)
     with rc_context(STYLE):
         figure = Figure(figsize=(8, 2.7 * height), layout="constrained")
         panels = list(figure.subplots(height, min(len(kinds), 2), squeeze=False).flat)
         for axes, kind in zip(panels, kinds, strict=False):
-            for (*of, algo), seeds in groups.items():
-                if tuple(of) == kind:
-                    _draw_curve(axes, seeds, algo.upper(), algos.index(algo))
+            for index, algo in enumerate(algos):
+                if seeds := groups.get((*kind, algo)):
+                    _draw_curve(axes, seeds, algo.upper(), index)
             level = random_return(*kind)
             axes.axhline(level, color=RULES, linewidth=1, linestyle=(0, (2, 2)), label="random actions")
+            axes.set_ylim(bottom=level - 0.15 * abs(level))
             axes.set_title("{}, {} actions".format(kind[0].removeprefix("mpe2/"), kind[1]))
             axes.set_ylabel("return, mean over agents")
             axes.set_xlabel("environment steps (thousands)")
         for axes in panels[len(kinds) :]:
             axes.set_visible(False)
         shown = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=len(shown))
+        order = sorted(shown, key=lambda label: [*(algo.upper() for algo in algos), "random actions"].index(label))
+        legend = figure.legend([shown[label] for label in order], order, loc="outside lower center", ncols=len(order))
+        legend.set_title("shaded: 95 % intervals of the mean over seeds")
         file.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(file)
     print(f"Figure: {file}")
@@ -274,7 +278,7 @@ def _draw_curve(axes: Axes, seeds: Sequence[Row], label: str, index: int) -> Non
     curves = np.array([row["mean_return"] for row in seeds])
     middle, half = np.array([interval(values) for values in curves.T]).T
     style = ("-", "--", "-.", (0, (1, 1)), (0, (7, 2, 1, 2, 1, 2)))[index % 5]
-    axes.plot(steps, middle, linestyle=style, color=colour_of(index), label=f"{label}, {len(seeds)} seeds")
+    axes.plot(steps, middle, linestyle=style, color=colour_of(index), label=label)
     axes.fill_between(steps, middle - half, middle + half, color=colour_of(index), alpha=0.15, linewidth=0)
 
 

@@ -105,18 +105,19 @@ def _draw_front(axes: Axes, preset: str, rules: Rows, sweep: Rows, tests: Rows) 
 
 
 @rc_context(STYLE)
-def draw_flight_fronts(tried: Rows, sealed: Rows, path: Path) -> None:
+def draw_flight_fronts(tried: Rows, twelve: Rows, sixteen: Rows, path: Path) -> None:
     """Draw plans sent against collisions in the symmetric swap of `flight`, with a panel for each number of robots:
     rules tried on validation episodes, and the sealed flights of the best rule, five models and full communication.
 
     :param tried: rows of `studies.swarm.tune_flight`
-    :param sealed: rows of its sealed sets
+    :param twelve: rows of its sealed set of rules and thresholds for up to twelve robots
+    :param sixteen: rows of that for up to sixteen
     :param path: path of the figure
     """
     figure = Figure(figsize=(8, 4), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, n in zip(panels, (8, 16), strict=True):
-        tries, flown = ([r for r in rows if _hardest(r, n)] for rows in (tried, sealed))
+        tries, *flown = ([r for r in rows if _hardest(r, n)] for rows in (tried, twelve, sixteen))
         # Most were dropped after few episodes, which say little unless some ended in collisions
         told = [r for r in tries if r["episodes"] >= 500 or r["collisions"] >= 3]
         rules = [r for r in told if not is_model(r["setting"]) and r["setting"] != "full"]
@@ -129,16 +130,12 @@ def draw_flight_fronts(tried: Rows, sealed: Rows, path: Path) -> None:
             alpha=0.45,
             label="hand-made rules: settings that were tried",
         )
-        learned = [r for r in flown if is_model(r["policy"])]
-        _points(
-            axes,
-            [r for r in flown if r["policy"].startswith("cpa")],
-            "D",
-            INK,
-            "best rules for up to 12 (left) and 16 robots",
-        )
-        _points(axes, learned, "*", LEARNED, "five models, thresholds for up to 12 (left) and 16")
-        full = [r for r in flown if r["policy"] == "full"]
+        for most, hollow, rows in ((12, False, flown[0]), (16, True, flown[1])):
+            best = [r for r in rows if r["policy"].startswith("cpa")]
+            _points(axes, best, "D", INK, f"best rule for up to {most} robots", hollow)
+            learned = [r for r in rows if is_model(r["policy"])]
+            _points(axes, learned, "*", LEARNED, f"five models, thresholds for up to {most} robots", hollow)
+        full = [r for rows in flown for r in rows if r["policy"] == "full"]
         _points(axes, full, "s", COLOURS[0], "full communication, in both sealed sets")
         axes.set_title(f"{'Eight' if n == 8 else 'Sixteen'} robots, symmetric swap")
         axes.set_xscale("log")
@@ -152,7 +149,7 @@ def draw_flight_fronts(tried: Rows, sealed: Rows, path: Path) -> None:
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter(lambda share, _: f"{100 * share:.4g}%")
         axes.set_xlabel("plans sent, of all possible")
-    panels[0].set_ylabel("flights with a collision")
+    panels[0].set_ylabel("flights with a collision (linear below 0.1 %)")
     handles = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
     figure.savefig(path)
@@ -162,7 +159,7 @@ def _hardest(row: dict[str, Any], n_robots: int) -> bool:
     return (row["scenario"], row["n_robots"]) == ("symmetric_swap", n_robots)
 
 
-def _points(axes: Axes, rows: Rows, marker: str, colour: str, label: str) -> None:
+def _points(axes: Axes, rows: Rows, marker: str, colour: str, label: str, hollow: bool = False) -> None:
     """Draw sealed flights with their 95 % intervals."""
     rates = [rate_of(r) for r in rows]
     errors = [[abs(r[f"collision_{end}"] - rate_of(r)) for r in rows] for end in ("low", "high")]
@@ -173,8 +170,9 @@ def _points(axes: Axes, rows: Rows, marker: str, colour: str, label: str) -> Non
         fmt=marker,
         color=colour,
         markersize=10 if marker == "*" else 6,
-        markeredgecolor="white",
-        markeredgewidth=0.7,
+        markerfacecolor="white" if hollow else colour,
+        markeredgecolor=colour if hollow else "white",
+        markeredgewidth=1.2 if hollow else 0.7,
         elinewidth=1,
         label=label,
     )

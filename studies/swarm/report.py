@@ -685,7 +685,8 @@ def main() -> None:
         draw_fronts(rules, sweep, test, NAMES[:2], args.images / "fronts.png")
         draw_fronts(rules, sweep, test, NAMES, args.images / "fronts_all.png")
         tried = [*rows["flight_tuning"], *read_rows(args.data / "flight_sixteen.json.gz")]
-        draw_flight_fronts(tried, [*rows["flight"], *rows["flight_sixteen_sealed"]], args.images / "front_flight.png")
+        sealed = rows["flight"], rows["flight_sixteen_sealed"]
+        draw_flight_fronts(tried, *sealed, args.images / "front_flight.png")
     if flown:
         draw_trajectories(flown, args.images / "flights.png")
     if asking:
