@@ -11,8 +11,9 @@ set 704 the same of four, twelve and sixteen (``four_again``, ``twelve_again``, 
 ``safe_small`` and ``safe_large``, the same model at a lower threshold, and ``among_four``, ``among_eight``,
 ``among_twelve`` and ``among_sixteen``, full communication and that model among obstacles, after these had been given a
 larger penalty than robots; set 707 ``trained_four``, ``trained_eight``, ``trained_twelve`` and ``trained_sixteen``, the
-packaged model, which was trained in version 2 and with obstacles. All parts before set 706 fly with equal penalties, as
-they did. JSON: one row per
+packaged model, which was trained in version 2 and with obstacles; set 708 ``seeds_four``, ``seeds_eight``,
+``seeds_twelve`` and ``seeds_sixteen``, its recipe with other training seeds, at its threshold. All parts before set 706
+fly with equal penalties, as they did. JSON: one row per
 policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run that is ended
 keeps what it has.
 """
@@ -38,7 +39,7 @@ from studies.swarm.experiment import condition
 from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
-SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED = range(700, 708)
+SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS = range(700, 709)
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -51,6 +52,7 @@ ONE_MODEL = f"{models('flight')[4]}@0.5"
 SAFE_MODEL = f"{models('flight')[4]}@0.4"
 # The model that was trained in version 2, at the threshold that was chosen on sets 51 and 52
 OWN_MODEL = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.4"
+OTHER_SEEDS = tuple(f"{model}@0.4" for model in models("flight_v2"))
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
 CHECKED: dict[str, Any] = {"radio": {"jitter": 0}, "planner": {"commitment": 0.0}}
@@ -115,6 +117,10 @@ PARTS = {
     "trained_twelve": Part((OWN_MODEL,), EVERYWHERE, (12,), 2000, TRAINED),
     "trained_sixteen": Part((OWN_MODEL,), EVERYWHERE, (16,), 2000, TRAINED),
     "trained_four": Part((OWN_MODEL,), EVERYWHERE, (4,), 2000, TRAINED),
+    "seeds_four": Part(OTHER_SEEDS, EVERYWHERE, (4,), 2000, SEEDS),
+    "seeds_eight": Part(OTHER_SEEDS, EVERYWHERE, (8,), 2000, SEEDS),
+    "seeds_twelve": Part(OTHER_SEEDS, EVERYWHERE, (12,), 2000, SEEDS),
+    "seeds_sixteen": Part(OTHER_SEEDS, EVERYWHERE, (16,), 2000, SEEDS),
 }
 
 
