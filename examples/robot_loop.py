@@ -65,69 +65,86 @@ class MyVehicle:
         self.flies = False
 
 
-def with_rule(index, n_robots):
-    """Return a robot that asks those whom it would come close to."""
-    return Robot(make_config("flight-v2", n_robots=n_robots), index, RulePolicy("cpa:1.1s:2"))
+def make_robot(index, n_robots, folder, rule):
+    """Return a robot with an exported policy, or with a rule, in the exported world if there is one."""
+    if rule is None:
+        return files.load(folder).robot(index)
+    config = files.load(folder).config if folder else make_config("flight-v2", n_robots=n_robots)
+    return Robot(config, index, RulePolicy(rule))
 
 
-def fly(index, addresses, begins, duration, folder, shared):
-    """Fly one robot to its goal from the time of the day at which all begin (us) on, and land after some time (s)."""
-    robot = files.load(folder).robot(index) if folder else with_rule(index, len(addresses))
-    if not len(addresses) == len(STARTS) == len(GOALS) == robot.config.n_robots:
+def fly(index, addresses, begins, duration, folder, rule, shared):
+    """Fly one robot to its goal from the time of the day at which all begin (us) on, and land after some time (s).
+
+    Return why it landed before, None if it did not."""
+    try:
+        robot = make_robot(index, len(addresses), folder, rule)
+    except ValueError as error:
+        raise SystemExit(f"robot {index}: {error}") from None
+    config = robot.config
+    if not len(addresses) == len(STARTS) == len(GOALS) == config.n_robots:
         counts = f"{len(addresses)} addresses, {len(STARTS)} STARTS and {len(GOALS)} GOALS"
-        raise SystemExit(f"{counts} for {robot.config.n_robots} robots")
+        raise SystemExit(f"{counts} for {config.n_robots} robots")
     (host, port), others = addresses[index], {k: a for k, a in enumerate(addresses) if k != index}
     link = UdpLink(index, others, host, port, session=7)  # a session that all share
-    vehicle = MyVehicle(index, robot.config, shared)
-    limits = SafetyLimits(fence=0.5)  # m beyond the workspace, and some more to brake: all that before your walls
+    vehicle = MyVehicle(index, config, shared)
+    # For your room: fence, braking and radius must fit between workspace and wall. Below the separation, here halfway
+    # between contact and what planners keep, robots hold their places. At the height `ground`, your vehicle stands.
+    limits = SafetyLimits(fence=0.3, separation=config.radius + config.planner.separation / 2, ground=0.1)
     loop = Loop(robot, link, vehicle, limits)
     loop.warm_up()  # the first time on a machine, it compiles the planner
     freeze_garbage()
     begins = link.own(begins)
-    if begins < monotonic():
-        raise SystemExit(f"robot {index}: it is too late to begin; the others must not start, either")
+    if not 0 < begins - monotonic() < 600_000_000:
+        ahead = (begins - monotonic()) / 1e6
+        raise SystemExit(f"robot {index}: it would begin in {ahead:.1f} s; give microseconds, in at most ten minutes")
     try:
         state = loop.ready().state
     except ValueError as error:
         raise SystemExit(f"robot {index}: {error}") from None
     if (beside := np.linalg.norm(state[POSITION] - STARTS[index])) > 0.3:
         raise SystemExit(f"robot {index} is {beside:.1f} m beside its start, {STARTS[index].tolist()}")
-
-    watchdog = Watchdog(vehicle, limits)
+    watchdog, supervisor, modes, reasons = Watchdog(vehicle, limits), loop.supervisor, [Mode.FLY], set()
     # Obstacles are given here, or listed in the exported world
     loop.start(STARTS[index], GOALS[index], link.now() + robot.period, heading=state[8], begins=begins)
 
     def land(*_):
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a second one ends the process in the air
-        loop.supervisor.land()
+        supervisor.land()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, land)
 
     def ended():
         if monotonic() > begins + round(duration * 1e6):
-            loop.supervisor.land()
+            supervisor.land()
         return loop.has_landed
 
     def after_period(loop):
-        watchdog.beat(armed=loop.supervisor.mode is not Mode.OFF)
+        watchdog.beat(armed=supervisor.mode is not Mode.OFF)
+        if supervisor.mode is not modes[-1]:
+            modes.append(supervisor.mode)
+            reasons.update(supervisor.why if supervisor.mode is Mode.LAND else ())
+            print(f"robot {index}: {supervisor.mode.name.lower()} {', '.join(sorted(supervisor.why))}", flush=True)
 
     print(f"robot {index} holds its start for {(begins - monotonic()) / 1e6:.1f} s", flush=True)
     statistics = loop.run(ended, after_period)
     watchdog.close()
     link.close()
-    counts, waits = statistics.counts, statistics.durations["round_trip"]
-    distance = np.linalg.norm(vehicle.sense().state[:2] - GOALS[index, :2])
+    counts, distance = statistics.counts, np.linalg.norm(vehicle.sense().state[:2] - GOALS[index, :2])
+    refused = sum(count for name, count in counts.items() if name.startswith("refused"))
     print(
-        f"robot {index}: {counts['periods']} periods, {counts['missed']} missed; {counts['requests']} requests, "
-        f"answered after {waits.quantile(0.5) / 1000:.1f} ms; landed {distance:.2f} m beside its goal"
+        f"robot {index}: {counts['periods']} periods, {counts['missed']} missed, {counts['late commands']} commands "
+        f"late; {counts['requests']} requests, {counts['plans received']} plans believed, {refused} messages refused; "
+        f"landed {distance:.2f} m beside its goal {statistics.last_error}"
     )
+    return ", ".join(reasons - {"told to land"}) or None
 
 
-def fly_all(duration):
+def fly_all(duration, folder, rule):
     """Start a process for each robot on this machine."""
     link = UdpLink(0)
-    Loop(with_rule(0, len(STARTS)), link, None).warm_up()  # compile once, not in each process
+    Loop(make_robot(0, len(STARTS), folder, rule), link, None).warm_up()  # compile once, not in each process
     link.close()
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in STARTS]
     for one in sockets:
@@ -135,11 +152,12 @@ def fly_all(duration):
     addresses = ["{}:{}".format(*one.getsockname()) for one in sockets]
     for one in sockets:
         one.close()
-    with tempfile.TemporaryDirectory() as folder:
-        shared = Path(folder) / "states"
+    with tempfile.TemporaryDirectory() as motion_capture:
+        shared = Path(motion_capture) / "states"
         np.hstack([STARTS, np.zeros((len(STARTS), 6))]).tofile(shared)
         words = ["--addresses", *addresses, "--begins", str(time.time_ns() // 1000 + 10_000_000)]
         words += ["--duration", str(duration), "--shared", str(shared)]
+        words += [word for name, value in (("--files", folder), ("--rule", rule)) if value for word in (name, value)]
         command = [sys.executable, __file__]
         robots = [subprocess.Popen([*command, "--index", str(k), *words]) for k in range(len(STARTS))]
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the robots, which land
@@ -147,22 +165,34 @@ def fly_all(duration):
             raise SystemExit("a robot ended with an error")
 
 
+def address(text):
+    """Parse HOST:PORT."""
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT")
+    return host, int(port)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--index", type=int, help="number of this robot")
-    parser.add_argument("--addresses", nargs="+", metavar="HOST:PORT", help="where robots receive, by their numbers")
+    parser.add_argument(
+        "--addresses", nargs="+", type=address, metavar="HOST:PORT", help="where robots receive, by their numbers"
+    )
     parser.add_argument("--begins", type=int, metavar="US", help="when all begin: microseconds of the time of the day")
-    parser.add_argument("--duration", type=float, default=6.0, metavar="S", help="when to land")
-    parser.add_argument("--files", metavar="FOLDER", help="an exported policy and its world; by default, a rule flies")
+    parser.add_argument("--duration", type=float, default=6.0, metavar="S", help="when to land, after that")
+    parser.add_argument("--files", metavar="FOLDER", help="an exported policy and its world")
+    parser.add_argument("--rule", help="a rule instead of the exported policy, such as none")
     parser.add_argument("--shared", metavar="FILE", help="states of the simulated vehicles")
     parser.add_argument("--quick", action="store_true", help="fly for a second only")
     args = parser.parse_args()
     if args.index is None:
-        fly_all(1.0 if args.quick else args.duration)
-    elif args.addresses is None or args.begins is None:
-        parser.error("--index needs --addresses and --begins")
-    elif args.shared is None:
+        rule = args.rule if args.files else args.rule or "cpa:1.1s:2"  # asks those whom it would come close to
+        sys.exit(fly_all(1.0 if args.quick else args.duration, args.files, rule))
+    if args.addresses is None or args.begins is None or not (args.files or args.rule):
+        parser.error("--index needs --addresses, --begins, and --files (or --rule, in the world flight-v2)")
+    if not 0 <= args.index < len(args.addresses):
+        parser.error(f"--index {args.index}: there are {len(args.addresses)} addresses, from 0")
+    if args.shared is None:
         parser.error("--shared: MyVehicle simulates, and needs the file; replace it by the class of your vehicle")
-    else:
-        places = [(host, int(port)) for host, port in (one.rsplit(":", 1) for one in args.addresses)]
-        fly(args.index, places, args.begins, args.duration, args.files, args.shared)
+    sys.exit(fly(args.index, args.addresses, args.begins, args.duration, args.files, args.rule, args.shared))

@@ -117,6 +117,7 @@ class Loop:
         if sensed is None:
             raise ValueError("no state of each robot has arrived: is their odometry published?")
         sensed = Sensed(int(sensed.stamp), *self.robot.perceived(*sensed[1:]))
+        self._check_stamp(sensed.stamp)
         if not (age := (now - sensed.stamp) / _US) <= limits.stale:
             raise ValueError(f"the oldest state is {age:.3f} s old, more than limits.stale={limits.stale:g}")
         if (height := sensed.state[2]) <= limits.ground:
@@ -172,6 +173,7 @@ class Loop:
         self._sensed: Sensed | None = None
         self._pending: dict[int, int] = {}  # whom it asked in this period, and when
         self._unheard = self._unheard_since = 0  # requests since the last message of anybody
+        self._refused = self._refused_since = 0  # plans since the last one that could be believed
         self._first = self.next_period = self._begins = 0
         self._failing_since: int | None = None  # of the planner
         self._off = 0  # periods since it has landed
@@ -315,8 +317,11 @@ class Loop:
             durations["round_trip"].add(now - self._pending.pop(sender))
         if self._flying and (reason := self._objection(sender, plan, period, now)) is None:
             self.robot.receive(sender, plan)
+            self._refused = 0
             self.statistics.counts["plans received"] += 1
         elif self._flying:
+            self._refused_since = now if not self._refused else self._refused_since
+            self._refused += 1
             self.statistics.counts[f"refused: {reason}"] += 1
 
     def _objection(self, sender: int, plan: Plan, period: int, now: int) -> str | None:
@@ -348,11 +353,7 @@ class Loop:
         try:
             sensed = self.vehicle.sense()
             if sensed is not None:
-                if (ahead := (int(sensed.stamp) - self.link.now()) / _US) > _AHEAD:
-                    raise ValueError(
-                        f"the state is from {ahead:.3g} s in the future: stamps are times of the robot's clock, to "
-                        "which link.own converts those that all robots share"
-                    )
+                self._check_stamp(sensed.stamp)
                 self._sensed = Sensed(int(sensed.stamp), *self.robot.perceived(*sensed[1:]))
         except Exception as error:
             self._note("sensing", error)
@@ -366,6 +367,13 @@ class Loop:
             self._note("planner", error)
             return None
         return Sensed(tick, state, sensed.pos + (tick - sensed.stamp) / _US * sensed.vel, sensed.vel)
+
+    def _check_stamp(self, stamp: int) -> None:
+        if (ahead := (int(stamp) - self.link.now()) / _US) > _AHEAD:
+            raise ValueError(
+                f"the state is from {ahead:.3g} s in the future: stamps are times of the robot's clock, to which "
+                "link.own converts those that all robots share"
+            )
 
     def _decided(self, tick: int, sensed: Sensed) -> np.ndarray:
         """Return whom to ask and whom to tell, (n - 1, 2) bool."""
@@ -423,10 +431,12 @@ class Loop:
             robot.hold[..., 2] = sensed.state[2] + below
 
     def _unanswered(self, now: int) -> float:
-        """Return the time without any message in spite of requests (s)."""
+        """Return the time without any message, or any plan that could be believed, in spite of requests (s)."""
         if now < self._begins:
-            self._unheard = 0
-        return (now - self._unheard_since) / _US if self._unheard >= _FEW else 0.0
+            self._unheard = self._refused = 0
+        silent = now - self._unheard_since if self._unheard >= _FEW else 0
+        refuses = now - self._refused_since if self._refused >= _FEW else 0
+        return max(silent, refuses) / _US
 
     def _is_teammate(self, sender: int) -> bool:
         if sender != self.robot.index and 0 <= sender < self.robot.config.n_robots:

@@ -1,4 +1,4 @@
-"""Supervision of one robot: what makes it hover or land instead of flying to its goal."""
+"""Supervision of one robot: what makes it hold its place, level or land instead of flying to its goal."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, PositiveFloat
 
+from quad_swarm.geometry import flattened, length
 from quad_swarm.quadrotor import N_INPUTS, POSITION, VELOCITY
 from quad_swarm.realtime.link import Sensed, Vehicle, monotonic
 from quad_swarm.validation import checked
@@ -23,7 +24,8 @@ _AT_REST = 0.01  # m/s, rad
 
 
 class Mode(IntEnum):
-    """What a robot does, in the order of precedence."""
+    """What a robot does, in the order of precedence. In `HOVER`, one that sees holds its place, one that does not see
+    any more brakes by its model, and one that never saw levels."""
 
     FLY = 0
     HOVER = 1
@@ -34,18 +36,19 @@ class Mode(IntEnum):
 @checked
 @dataclass(frozen=True)
 class SafetyLimits:
-    """When a robot hovers, and when it lands. Times are in seconds, lengths in metres.
+    """When a robot holds its place, brakes by its model, levels, and lands. Times are in seconds, lengths in metres.
 
-    :param stale: age of the perceived state from which on it hovers
-    :param lost: age of the perceived state from which on it lands; also for a state that is frozen, and a planner that
-        fails
+    :param stale: age of the perceived state from which on it brakes by its model
+    :param lost: age of the perceived state from which on it lands; also for a state that is frozen or was never there,
+        and for a planner that fails
     :param frozen: time after which a state that stays the same to the last bit is none, unless the robot is at rest
-    :param unanswered: time without any message in spite of requests after which the robot hovers, and asks everybody
+    :param unanswered: time without any message, or any plan that could be believed, in spite of requests, after which
+        the robot holds its place and asks everybody
     :param silence: the same, after which it lands
-    :param separation: distance to another robot below which it hovers, see `SwarmConfig` for robots of unlike radii;
-        None for that of a collision
-    :param fence: how far it may leave the workspace to the sides and upwards, before it lands
-    :param hung: time without a sign of life of the loop after which the watchdog hovers
+    :param separation: distance to another robot below which it holds its place, in the metric of collisions (see
+        `SwarmConfig` for robots of unlike radii and for downwash); None for that of a collision
+    :param fence: how far it may leave the workspace to the sides and upwards, before it lands; nothing guards downwards
+    :param hung: time without a sign of life of the loop after which the watchdog levels
     :param landing: climb rate of a landing (m/s), negative. Where the planner's limit of descents is lower, robots land
         with that, and may take longer in proportion
     :param ground: height at which it has landed; a robot that sees itself above it does not disarm
@@ -97,6 +100,7 @@ class Supervisor:
         self.limits = limits
         self._excess = 0.0 if config.excess is None else np.delete(config.excess[robot], robot)
         contact = 2 * config.radius - config.collision_tolerance
+        self._downwash = config.planner.downwash
         self._apart = contact if limits.separation is None else limits.separation
         low, high = np.array(config.planner.workspace_low), np.array(config.planner.workspace_high)
         self._low, self._high = low - limits.fence, high + limits.fence
@@ -109,6 +113,7 @@ class Supervisor:
         self.mode, self.why, self.sees = Mode.FLY, frozenset[str](), False
         self._state: np.ndarray | None = None
         self._changed = self._landing_since = 0
+        self._began: int | None = None  # when it was checked first
         self._height = self._highest  # where it was seen last
         self._low_since: int | None = None  # since when it has been seen on the ground (us)
         self._low_for = 0.0  # and for how long (s)
@@ -139,8 +144,9 @@ class Supervisor:
         limits, why = self.limits, dict[str, Mode]()
         if self.shall_land:
             why["told to land"] = Mode.LAND
+        self._began = now if self._began is None else self._began
         if sensed is None:
-            why["no state yet"] = Mode.HOVER
+            why["no state yet"] = Mode.LAND if now - self._began > limits.lost * _US else Mode.HOVER
         else:
             why |= self._objections(now, sensed, setpoint)
         if unanswered > limits.unanswered:
@@ -168,7 +174,8 @@ class Supervisor:
             why["state is frozen"] = Mode.LAND if same > limits.lost else Mode.HOVER
         if (own < self._low).any() or (own > self._high).any():
             why["outside the fence"] = Mode.LAND
-        if len(sensed.pos) and (np.linalg.norm(sensed.pos - own, axis=1) - self._excess).min() < self._apart:
+        distances = length(flattened(sensed.pos - own, self._downwash)) - self._excess
+        if (distances < self._apart).any():
             why["too close"] = Mode.HOVER
         return why
 
@@ -211,8 +218,8 @@ class Supervisor:
 
 
 class Watchdog:
-    """A thread that hovers, and later lands, if the loop hangs. An autopilot's link may repeat the last set-point for
-    ever.
+    """A thread that levels, and later lands, if the loop hangs: an autopilot's link may repeat the last set-point for
+    ever. It ends after `SafetyLimits.landing_time`; then, the autopilot's failsafe has to act.
 
     :ivar barks: how often it stepped in
 
@@ -245,6 +252,8 @@ class Watchdog:
             silent = (monotonic() - self._beaten) / _US
             if not self._armed or silent < self._limits.hung:
                 barking = False
+                continue
+            if silent > self._limits.hung + self._limits.lost + self._limits.landing_time:
                 continue
             self.barks += not barking
             barking = True

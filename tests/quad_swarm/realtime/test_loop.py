@@ -205,6 +205,38 @@ def test_who_gets_no_answers_hovers_and_asks_everybody():
     np.testing.assert_array_equal(loop.robot.goal[0, 0], [3.0, 0, 1.5])
 
 
+def test_who_believes_nobody_s_plans_hovers_and_lands():
+    """As when clocks disagree: messages arrive, and each of them is refused."""
+    loop, _link, _vehicle = make("full")
+    modes = []
+    for _ in range(210):
+        modes += periods(loop, 1)
+        loop.on_request(1)
+        loop.on_plan(1, plan_of(0, loop.link.now() + 200_000), 0, PERIOD)
+    assert modes[:20] == [Mode.FLY] * 20
+    assert modes[25:200] == [Mode.HOVER] * 175
+    assert modes[-1] is Mode.LAND
+    assert loop.supervisor.why >= {"no answers"}
+
+
+def test_one_plan_that_is_refused_is_no_silence():
+    loop, _link, _vehicle = make("full")
+    modes = []
+    for _ in range(40):
+        modes += periods(loop, 1)
+        loop.on_plan(1, plan_of(0, loop.link.now() + 200_000), 0, PERIOD)
+        loop.on_plan(2, plan_of(1, loop.link.now()), 0, PERIOD)
+    assert modes == [Mode.FLY] * 40
+
+
+def test_a_robot_that_never_sees_lands():
+    loop, _link, vehicle = make("none")
+    vehicle.perceived = lambda: None
+    modes = periods(loop, 23)
+    assert modes[:21] == [Mode.HOVER] * 21
+    assert modes[-1] is Mode.LAND
+
+
 def test_another_goal_counts_from_the_next_period_on():
     loop, _link, _vehicle = make()
     periods(loop, 1)
@@ -332,6 +364,7 @@ def test_a_robot_that_waits_can_be_told_to_land():
 
 
 NOT_READY = {
+    "from 5 s in the future": lambda now, state: Sensed(now + 5_000_000, state, OTHERS, 0 * OTHERS),
     "no state of each robot": lambda now, state: None,
     "0.300 s old": lambda now, state: Sensed(now - 300_000, state, OTHERS, 0 * OTHERS),
     "on the ground": lambda now, state: Sensed(now, state * [1, 1, 0, 1, 1, 1, 1, 1, 1], OTHERS, 0 * OTHERS),

@@ -160,6 +160,21 @@ def test_unlike_robots_touch_where_their_surfaces_do(robot, reach):
             assert modes(supervisor, [lambda now, others=others: sensed(now, others=others)]) == [mode]
 
 
+def test_near_is_in_the_metric_of_collisions():
+    """With downwash, contact above and below is farther away than beside."""
+    config = make_config(CONFIG, {"planner": {"downwash": 3.0}})
+    contact = 2 * config.radius - config.collision_tolerance
+    for place, mode in (
+        ((0, 0, 2.9 * contact), Mode.HOVER),
+        ((0, 0, 3.1 * contact), Mode.FLY),
+        ((0, 1.1 * contact, 0), Mode.FLY),
+    ):
+        others = np.array([[3.0, 0, 1.5], np.add([0, 0, 1.5], place)])
+        assert modes(Supervisor(config, SafetyLimits()), [lambda now, others=others: sensed(now, others=others)]) == [
+            mode
+        ]
+
+
 @pytest.mark.parametrize(("unanswered", "mode"), [(0.9, Mode.FLY), (1.1, Mode.HOVER), (10.1, Mode.LAND)])
 def test_nobody_answers(unanswered, mode):
     supervisor = Supervisor(CONFIG, SafetyLimits())
@@ -187,7 +202,7 @@ class Recorder:
 
 def test_a_loop_that_hangs_is_noticed():
     vehicle = Recorder()
-    watchdog = Watchdog(vehicle, SafetyLimits(hung=0.05, stale=0.1, lost=0.2))
+    watchdog = Watchdog(vehicle, SafetyLimits(hung=0.05, stale=0.1, lost=0.2))  # lands for 20 s
     try:
         assert not vehicle.levelled.wait(0.2), "before it is armed"
         watchdog.beat()
@@ -216,3 +231,16 @@ def test_an_error_of_the_vehicle_does_not_end_the_watchdog():
     watchdog.beat()
     assert enough.wait(30)
     watchdog.close()
+
+
+def test_the_watchdog_ends_with_the_landing():
+    """Then, the autopilot's failsafe has to act."""
+    vehicle = Recorder()
+    watchdog = Watchdog(vehicle, SafetyLimits(hung=0.02, stale=0.1, lost=0.1, landing_time=0.1))
+    watchdog.beat()
+    assert vehicle.lands.wait(500)
+    time.sleep(1.0)
+    before = len(vehicle.commands)
+    time.sleep(0.3)
+    watchdog.close()
+    assert len(vehicle.commands) == before
