@@ -514,7 +514,7 @@ def glance_table(rows: Rows, best: str) -> str:
     groups = {
         "nobody tells anybody": [row for row in here if row["policy"] == "none"],
         "everybody tells everybody": [row for row in here if row["policy"] == FULL],
-        f"cheapest of {RULES_TRIED} rules that is safe with up to twelve robots": [r for r in here if r["policy"] == best],
+        f"cheapest of {RULES_TRIED} rules that is safe with up to twelve": [r for r in here if r["policy"] == best],
         "**learned**": [row for row in here if "/flight_seed" in row["policy"]],
     }
     lines = []
