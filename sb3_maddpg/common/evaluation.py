@@ -14,6 +14,7 @@ from sb3_maddpg.common.callbacks import widen_tables
 from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError
 from sb3_maddpg.team.team import Team
 from sb3_maddpg.utils import suggest
+from sb3_maddpg.vec_env.wrap import as_vec_env
 
 MEAN_REWARD, SUCCESS_RATE = "mean_reward", "success_rate"  # what ``best_by`` may name beside agents
 _RESAMPLES = 10_000
@@ -178,14 +179,14 @@ class TeamEvalCallback(EvalCallback):
     ``eval/ep_len_NAME`` where agents end before others, and writes both to ``evaluations.npz``: ``agent_names``, (n,),
     ``agent_results`` and ``agent_lengths``, (evaluations, episodes, n).
 
-    :param eval_env: a team environment of its own
+    :param eval_env: an environment of its own, of PettingZoo or a team environment of Gymnasium
     :param best_by: what makes a model the best one: ``"mean_reward"`` of the team, ``"success_rate"``, or the name of
         an agent for its return
     :param arguments: those of ``EvalCallback``
     """
 
     def __init__(self, eval_env: Any, best_by: str = MEAN_REWARD, **arguments: Any):
-        super().__init__(eval_env, **arguments)
+        super().__init__(as_vec_env(eval_env), **arguments)
         self._names = agent_names(self.eval_env)
         known = (MEAN_REWARD, SUCCESS_RATE, *self._names)
         if best_by not in known:

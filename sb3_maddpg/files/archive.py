@@ -81,7 +81,7 @@ def opened(path: Any, kind: str = "model", suffix: str | None = None) -> Iterato
                 file = open_path(Path(path), "r", suffix=lacks)
             except FileNotFoundError as error:
                 beside = [one.name for one in Path(path).parent.glob(f"*.{suffix or '*'}")]
-                hint = did_you_mean(Path(path).name, beside, 0.5)
+                hint = did_you_mean(Path(path).name, beside, 0.6)
                 where = "" if Path(path).is_absolute() else f" (in the folder {os.getcwd()})"
                 text = f"There is no such {kind} file{where}{hint and '.' + hint}"
                 raise FileNotFoundError(error.errno, text, error.filename) from None

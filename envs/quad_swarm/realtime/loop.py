@@ -250,14 +250,9 @@ class Loop:
         sensed = self._perceived()
         unplanned = 0.0 if self._failing_since is None else (now - self._failing_since) / _US
         mode = self.supervisor.check(now, sensed, self._setpoint, self._unanswered(now), unplanned)
-        if mode is Mode.OFF or not (self.supervisor.sees or mode is Mode.HOVER):
-            sensed = None
-        elif sensed is not None and self.supervisor.sees:
+        self._plans = mode is not Mode.OFF and self.supervisor.sees
+        if self._plans and sensed is not None:
             statistics.durations["sensed"].add(tick - sensed.stamp)
-        elif sensed is not None:
-            sensed = self._presumed(tick, sensed)
-        self._plans = sensed is not None
-        if sensed is not None:
             self._aim(mode, sensed)
             self._talk(self._decided(tick, sensed))
         self._asked_at = link.now()
@@ -358,15 +353,6 @@ class Loop:
         except Exception as error:
             self._note("sensing", error)
         return self._sensed
-
-    def _presumed(self, tick: int, sensed: Sensed) -> Sensed | None:
-        """Return what a robot that does not see any more presumes: it brakes by its model until it lands."""
-        try:
-            state = self.robot.perceived(self.robot.reckoned(tick), sensed.pos, sensed.vel)[0]
-        except Exception as error:  # of a model from outside, too
-            self._note("planner", error)
-            return None
-        return Sensed(tick, state, sensed.pos + (tick - sensed.stamp) / _US * sensed.vel, sensed.vel)
 
     def _check_stamp(self, stamp: int) -> None:
         if (ahead := (int(stamp) - self.link.now()) / _US) > _AHEAD:

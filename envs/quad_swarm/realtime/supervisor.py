@@ -24,8 +24,7 @@ _AT_REST = 0.01  # m/s, rad
 
 
 class Mode(IntEnum):
-    """What a robot does, in the order of precedence. In `HOVER`, one that sees holds its place, one that does not see
-    any more brakes by its model, and one that never saw levels."""
+    """What a robot does, in the order of precedence. In `HOVER`, one that sees holds its place; another one levels."""
 
     FLY = 0
     HOVER = 1
@@ -36,9 +35,9 @@ class Mode(IntEnum):
 @checked
 @dataclass(frozen=True)
 class SafetyLimits:
-    """When a robot holds its place, brakes by its model, levels, and lands. Times are in seconds, lengths in metres.
+    """When a robot holds its place, levels, and lands. Times are in seconds, lengths in metres.
 
-    :param stale: age of the perceived state from which on it brakes by its model
+    :param stale: age of the perceived state from which on it levels
     :param lost: age of the perceived state from which on it lands; also for a state that is frozen or was never there,
         and for a planner that fails
     :param frozen: time after which a state that stays the same to the last bit is none, unless the robot is at rest

@@ -152,7 +152,6 @@ class Robot:
         self.heading = facing[None].copy()
         self.fly_to(goal, velocity, waypoints, heading)
         self._estimate, self._u = x[None], np.zeros((1, 1, N_INPUTS))
-        self._then = self._estimate  # the state when the set-point takes effect
         self._pos = self._vel = np.zeros((1, 1, len(self.others), 3))
         planner = self.config.planner
         self._plans = Plans.steady(x, planner.horizon, planner.dt, np.array([late]))
@@ -301,15 +300,6 @@ class Robot:
             self._goal = self._route.current()
         return np.asarray(self.policy(self), bool)
 
-    def reckoned(self, now: int) -> np.ndarray:
-        """Return where the own state should be by the model and the last set-point, (9,), for robots that do not see.
-
-        :param now: a time after the last period began (us)
-        """
-        time = np.full((1, 1), max((now - self.now) * 1e-6 - self.late * self.config.planner.dt, 0.0))
-        disturbance = None if self.disturbance is None else self.disturbance.acceleration
-        return self.planner.model.ahead(self._then, self._u, time, disturbance)[0, 0]
-
     def sent(self, other: int, stamp: int | None = None) -> None:
         """Note that the own plan went to another robot, which now presumably knows it.
 
@@ -350,7 +340,7 @@ class Robot:
         kept_to = self.commitment if self.hold is None else None
         beside = (kept_to, self.disturbance, heading, self.bodies)
         problems = make_problems(self.config, self.planner.model, *arguments, *beside)
-        self._plans, self._then = self.planner.plan(problems, self._plans), problems.x[None]
+        self._plans = self.planner.plan(problems, self._plans)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
         if self.disturbance is not None:
             self.disturbance.expect(problems.x[None], self._u, late)

@@ -5,7 +5,7 @@ import gc
 import numpy as np
 import pytest
 
-from quad_swarm.quadrotor import VELOCITY, QuadrotorModel
+from quad_swarm.quadrotor import VELOCITY
 from quad_swarm.realtime import Loop, Mode, SafetyLimits, Sensed
 from quad_swarm.realtime.loop import thaw_garbage
 from quad_swarm.robot import Plan, Robot, RulePolicy
@@ -274,29 +274,6 @@ def test_a_robot_without_a_state_hovers_and_then_lands(bad):
     counts = loop.stop().counts
     assert counts["state is stale"] == 1
     assert counts["errors: sensing"] == (0 if bad is None else 40)
-
-
-def test_a_robot_that_does_not_see_any_more_brakes_by_its_model_before_it_lands():
-    loop, link, vehicle = make("none")
-    model = QuadrotorModel(CONFIG.quadrotor, PERIOD * 1e-6)
-    vehicle.state[VELOCITY] = [1.5, 0, 0]
-    loop.start(np.array([0, 0, 1.5]), np.array([40.0, 0, 1.5]), 0)
-    seen, far = True, OTHERS + np.array([0, 20.0, 0])
-
-    def perceived():
-        return Sensed(link.time, vehicle.state, far, 0 * OTHERS) if seen else last
-
-    vehicle.perceived, modes, speeds = perceived, [], []
-    for k in range(32):
-        if k == 4:
-            seen, last = False, Sensed(link.time, vehicle.state, far, 0 * OTHERS)
-        modes += periods(loop, 1)
-        vehicle.state = model.step(vehicle.state[None], vehicle.commands[-1][1][None])[0]
-        speeds.append(vehicle.state[3])
-    assert modes[4:] == [Mode.FLY] * 4 + [Mode.HOVER] * 16 + [Mode.LAND] * 8
-    assert speeds[8] > 1.2
-    assert abs(speeds[24]) < 0.4, "it had not been told any velocity since"
-    assert vehicle.commands[-1][1].tolist() == [0, 0, -0.5, 0]
 
 
 def test_a_state_with_the_stamp_of_another_clock_is_none():

@@ -157,6 +157,13 @@ def test_the_returns_of_agents_are_logged_with_the_evaluation(tmp_path):
     assert {"eval/ep_rew_categorical_0", "eval/ep_rew_categorical_1", "eval/ep_len_categorical_0"} <= set(titles)
 
 
+def test_an_environment_of_pettingzoo_is_evaluated_as_it_is(tmp_path):
+    model = MADDPG("MlpPolicy", Leaver(), **SMALL)
+    callback = TeamEvalCallback(Leaver(), eval_freq=30, n_eval_episodes=2, log_path=str(tmp_path), verbose=0)
+    model.learn(30, callback=callback)
+    assert np.load(tmp_path / "evaluations.npz")["agent_results"].shape == (1, 2, 2)
+
+
 def test_the_best_by_successes_needs_successes():
     model = MADDPG("MlpPolicy", TeamEnv(Leaver()), **SMALL)
     callback = TeamEvalCallback(make_vec_env(Leaver), best_by="success_rate", eval_freq=30, n_eval_episodes=2)
