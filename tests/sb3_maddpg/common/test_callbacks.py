@@ -113,7 +113,7 @@ def test_an_environment_that_never_says_whether_it_succeeded_is_refused():
     "kwargs", [{"success_threshold": 0.0}, {"success_threshold": 1.1}, {"window": 0}, {"window": 2.5}]
 )
 def test_bad_arguments_are_refused(kwargs):
-    with pytest.raises(ValueError, match=r"must be a (fraction|number) of episodes"):
+    with pytest.raises(ValueError, match=r"must be a (fraction|whole number) of episodes"):
         CurriculumCallback(**kwargs)
 
 

@@ -210,7 +210,7 @@ def test_tasks_are_proper_environments():
         ({"exploration_noise": -0.1}, r"exploration_noise=-0\.1 must be a standard deviation"),
         ({"exploration_noise": (0.1, 0.2, 0.3)}, "or two of them"),
         ({"temperature": 0.0}, r"temperature=0\.0 must be positive"),
-        ({"n_steps": 0}, "n_steps=0 must be a number of steps of at least 1"),
+        ({"n_steps": 0}, "n_steps=0 must be a whole number of steps, at least 1"),
         ({"tau": "fast"}, "tau='fast' must be a number above 0 and up to 1"),
         ({"gamma": 1.5}, "gamma=1.5 must be a number between 0 and 1"),
         ({"policy_delay": 0}, "policy_delay=0 must be a number of critic updates, an integer of at least 1"),
