@@ -104,7 +104,7 @@ PARTS = {
     "eight": Part(("full",), EVERYWHERE, (8,), 10000, MORE),
     "four_again": Part(("full",), EVERYWHERE, (4,), 10000, AGAIN),
     "twelve_again": Part(("full",), EVERYWHERE, (12,), 10000, AGAIN),
-    "crowd_again": Part(("full",), EVERYWHERE, (16,), 10000, AGAIN),
+    "crowd_again": Part(("full",), tuple(without_obstacles()), (16,), 10000, AGAIN),
     "one_small": Part((ONE_MODEL,), tuple(without_obstacles()), (4, 8), 4000, ONE),
     "one_large": Part((ONE_MODEL,), tuple(without_obstacles()), (12, 16), 2000, ONE),
     "safe_small": Part((SAFE_MODEL,), tuple(without_obstacles()), (4, 8), 4000, AMONG),
