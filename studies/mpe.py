@@ -284,9 +284,8 @@ def _draw_curve(axes: Axes, seeds: Sequence[Row], label: str, index: int) -> Non
 
 
 def write(rows: Sequence[Row], file: Path) -> None:
-    """Write the results with the versions and recipes that produced them."""
+    """Write the results with the versions and recipes that produced them; each row names its own command."""
     about = {
-        "command": " ".join(["python -m studies.mpe", *sys.argv[1:]]),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
         "eval_freq": EVAL_FREQ,
         "eval_episodes": EVAL_EPISODES,
