@@ -7,11 +7,13 @@ import errno
 import functools
 import glob
 import hashlib
+import importlib
 import inspect
 import json
 import math
 import operator
 import os
+import pkgutil
 import re
 import secrets
 import sys
@@ -89,6 +91,19 @@ def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.7) -> str:
     """
     nearest = difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
     return f" Did you mean '{nearest[0]}'?" if nearest else ""
+
+
+def modules_beside(name: str) -> set[str]:
+    """
+    :param name: name of a module, which may not exist
+    :return: the modules of its package, or without a package, those of the current folder and all installed ones
+    """
+    package, dot, _ = name.rpartition(".")
+    try:
+        paths = list(importlib.import_module(package).__path__) if dot else [str(Path.cwd()), *sys.path]
+    except (ImportError, AttributeError):  # not a package
+        return set()
+    return {package + dot + module.name for module in pkgutil.iter_modules(paths)}
 
 
 def remove_empty_log_folder(model: BaseAlgorithm) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -23,12 +22,11 @@ from stable_baselines3.common.vec_env import (
     is_vecenv_wrapped,
 )
 
-from sb3_maddpg.cli.options import modules_beside
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv
 from sb3_maddpg.cli.recipe import wrapper_of
 from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError
 from sb3_maddpg.team import pettingzoo_ids
-from sb3_maddpg.utils import did_you_mean, shown, suggest, told
+from sb3_maddpg.utils import shown, told
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 from sb3_maddpg.vec_env.normalize import SafeVecNormalize
 from sb3_maddpg.vec_env.states import Replayable, tells_state
@@ -50,29 +48,7 @@ def find_environment(env_id: str | None) -> str:
         )
     if pettingzoo_ids.register(env_id):
         return env_id
-    if (entry := pettingzoo_ids.module_of(env_id)).isidentifier() and (path := Path(f"{entry}.py")).is_file():
-        raise InvalidArgumentError(
-            f"{path} has no function parallel_env, which creates a PettingZoo environment: add one, such as "
-            "`parallel_env = MyEnv` for a class."
-        )
-    package, slash, _ = env_id.rpartition("/")
-    ids = pettingzoo_ids.siblings(env_id) or list(gymnasium.registry)
-    if slash and not any(name.startswith(f"{package}/") for name in ids):
-        raise InvalidArgumentError(
-            f"Unknown environment '{env_id}': there is no module {env_id.replace('/', '.')} with a function "
-            "parallel_env, as PettingZoo's modules have. Is its package installed or in this folder?"
-            f"{did_you_mean(package, modules_beside(package))}"
-        )
-    if env_id.isidentifier() and (packaged := pettingzoo_ids.packaged(env_id)):
-        raise InvalidArgumentError(f"Unknown environment '{env_id}'. Did you mean {' or '.join(map(repr, packaged))}?")
-    if difflib.get_close_matches(env_id, ids, n=1):
-        raise InvalidArgumentError(suggest("environment", env_id, ids))
-    nearest = ", ".join(difflib.get_close_matches(env_id, ids, n=3, cutoff=0))
-    raise InvalidArgumentError(
-        f"Unknown environment '{env_id}'. The nearest ids are {nearest}. A PettingZoo environment is "
-        "PACKAGE/MODULE, or MODULE for a file in this folder, with a function parallel_env. --gym-packages imports "
-        "packages that register other environments."
-    )
+    raise InvalidArgumentError(pettingzoo_ids.unknown(env_id))
 
 
 def is_stochastic(env_id: str) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import pkgutil
 import re
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from sb3_maddpg.cli.algorithms import ALGORITHMS
 from sb3_maddpg.cli.literals import parse_value
 from sb3_maddpg.cli.parser import Parser
 from sb3_maddpg.errors import InvalidArgumentError
-from sb3_maddpg.utils import did_you_mean, shown, told
+from sb3_maddpg.utils import did_you_mean, modules_beside, shown, told
 
 PROG = "sb3-maddpg"
 ENGINES = ("local", "ray")
@@ -325,19 +324,6 @@ def importing_from(folder: Path | None, names: Iterable[str] = ()) -> Iterator[N
         yield
     finally:
         sys.path[:] = before
-
-
-def modules_beside(name: str) -> set[str]:
-    """
-    :param name: name of a module, which may not exist
-    :return: the modules of its package, or without a package, those of the current folder and all installed ones
-    """
-    package, dot, _ = name.rpartition(".")
-    try:
-        paths = list(importlib.import_module(package).__path__) if dot else [str(Path.cwd()), *sys.path]
-    except (ImportError, AttributeError):  # not a package
-        return set()
-    return {package + dot + module.name for module in pkgutil.iter_modules(paths)}
 
 
 def files_beside(path: str, pattern: str) -> list[str]:

@@ -47,7 +47,7 @@ from sb3_maddpg.files.model_files import FILE_FORMAT
 from sb3_maddpg.files.saving import Lean, SavesSafely
 from sb3_maddpg.files.typed_json import encode
 from sb3_maddpg.team.agents import agent_actions, flat_observation
-from sb3_maddpg.team.pettingzoo_ids import register, similar
+from sb3_maddpg.team.pettingzoo_ids import register, unknown
 from sb3_maddpg.team.spaces import ACTION_SPACES, MixedActions, into_box, plain_joint_space
 from sb3_maddpg.utils import describe_env, remove_empty_log_folder, shown, suggest
 from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, TeamArguments, validated
@@ -832,13 +832,10 @@ def _explained_id(env: Any) -> Iterator[None]:
     """
     try:
         yield
-    except gymnasium.error.UnregisteredEnv as error:
-        if hint := similar(env):
-            raise InvalidEnvironmentError(f"There is no environment {env!r}.{hint}") from error
-        raise InvalidEnvironmentError(
-            f"env={env!r} is no id that Gymnasium knows ({error}), nor PACKAGE/MODULE of a PettingZoo environment: "
-            f"pass the environment itself, or import the package that registers the id first."
-        ) from error
+    except gymnasium.error.Error as error:
+        if not isinstance(env, str) or env in gymnasium.registry or ":" in env:  # of the environment itself
+            raise
+        raise InvalidEnvironmentError(unknown(env)) from error
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Gymnasium ids for PettingZoo modules, which have a function ``parallel_env``."""
 
+import difflib
 import importlib.metadata
 import importlib.util
 import inspect
@@ -10,7 +11,7 @@ from contextlib import suppress
 import gymnasium
 
 from sb3_maddpg.team.pettingzoo import ENTRY_POINT, find_module, find_parallel_env, make
-from sb3_maddpg.utils import did_you_mean
+from sb3_maddpg.utils import did_you_mean, modules_beside, suggest
 
 
 def register(env_id: str) -> bool:
@@ -54,14 +55,36 @@ def siblings(env_id: str) -> list[str]:
     return [f"{package}/{found.name}" for found in pkgutil.iter_modules(paths) if re.search(r"_v\d+$", found.name)]
 
 
-def similar(env_id: str) -> str:
+def unknown(env_id: str) -> str:
     """
     :param env_id: an id that neither Gymnasium nor ``register`` knows
-    :return: a question about the id that was perhaps meant, to append to a message; empty if there is none
+    :return: the message that says so, with the id or the function that is perhaps missing
     """
-    module = env_id.rpartition("/")[2]
-    known = packaged(module) if module.isidentifier() else []
-    return did_you_mean(env_id, known, 0.3) or did_you_mean(env_id, siblings(env_id) or gymnasium.registry)
+    module = module_of(env_id)
+    named = all(part.isidentifier() for part in module.split("."))
+    if named and (found := find_module(module)) and not hasattr(found, "__path__"):
+        return (
+            f"{module.replace('.', '/')}.py has no function parallel_env, which creates a PettingZoo environment: add "
+            "one, such as `parallel_env = MyEnv` for a class."
+        )
+    if named and (known := packaged(module.rpartition(".")[2])):
+        return f"Unknown environment '{env_id}'. Did you mean {' or '.join(map(repr, known))}?"
+    package, slash, _ = env_id.rpartition("/")
+    ids = siblings(env_id) or list(gymnasium.registry)
+    if slash and not any(name.startswith(f"{package}/") for name in ids):
+        return (
+            f"Unknown environment '{env_id}': there is no module {env_id.replace('/', '.')} with a function "
+            "parallel_env, as PettingZoo's modules have. Is its package installed or in this folder?"
+            f"{did_you_mean(package, modules_beside(package))}"
+        )
+    if difflib.get_close_matches(env_id, ids, n=1):
+        return suggest("environment", env_id, ids)
+    nearest = ", ".join(difflib.get_close_matches(env_id, ids, n=3, cutoff=0))
+    return (
+        f"Unknown environment '{env_id}'. The nearest ids are {nearest}. A PettingZoo environment is PACKAGE/MODULE, "
+        "or MODULE for a file in this folder, with a function parallel_env. Packages that register other environments "
+        "have to be imported first (on the command line, by --gym-packages)."
+    )
 
 
 def packaged(module: str) -> list[str]:

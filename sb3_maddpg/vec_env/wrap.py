@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.errors import InvalidEnvironmentError
 from sb3_maddpg.team.pettingzoo import TeamEnv, what_to_pass
-from sb3_maddpg.team.pettingzoo_ids import register, similar
+from sb3_maddpg.team.pettingzoo_ids import register, unknown
 from sb3_maddpg.team.team import Team
 from sb3_maddpg.utils import shown
 from sb3_maddpg.vec_env.checks import check_vec_env
@@ -71,12 +71,7 @@ def make_vec_env(
         raise InvalidEnvironmentError(f"n_envs={shown(n_envs)}: it must be an integer of at least 1.")
     if isinstance(env, str):
         if not register(env):
-            if hint := similar(env):
-                raise InvalidEnvironmentError(f"There is no environment {shown(env)}.{hint}")
-            raise InvalidEnvironmentError(
-                f"env={shown(env)} is neither an id that Gymnasium knows nor PACKAGE/MODULE of a PettingZoo "
-                "environment."
-            )
+            raise InvalidEnvironmentError(unknown(env))
         env = gymnasium.spec(env).make
     if not callable(env):
         raise InvalidEnvironmentError(

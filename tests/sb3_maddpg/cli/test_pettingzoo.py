@@ -115,7 +115,8 @@ def test_the_packaged_recipes_train_both_kinds_of_actions(in_logs, capsys, algor
     ("argv", "message"),
     [
         (["--env", "mpe2/simple_spred_v3"], "did you mean 'mpe2/simple_spread_v3'?"),
-        (["--env", "mpe3/simple_spread_v3"], "no module mpe3.simple_spread_v3 with a function parallel_env"),
+        (["--env", "mpe3/simple_spread_v3"], "Did you mean 'mpe2/simple_spread_v3'?"),
+        (["--env", "mpe3/mine_v0"], "no module mpe3.mine_v0 with a function parallel_env"),
         (["--env", "QuadSwram-v0"], "did you mean 'QuadSwarm-v0'?"),
         (["--env", "zzzz"], "A PettingZoo environment is PACKAGE/MODULE, or MODULE for a file in this folder"),
         ([*SPREAD, "--env-kwargs", "continous_actions:True"], "did you mean 'continuous_actions'?"),

@@ -19,7 +19,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
-from sb3_maddpg import MADDPG, check_team_env
+from sb3_maddpg import MADDPG, check_team_env, make_vec_env
 from sb3_maddpg.team.pettingzoo import TeamEnv
 from sb3_maddpg.vec_env.wrap import as_vec_env
 from toys import Toy
@@ -846,11 +846,20 @@ def test_a_vectorised_environment_is_no_single_one():
         MADDPG("MlpPolicy", envs)
 
 
-@pytest.mark.parametrize("env_id", ["my_envs/x", "Nowhere-v7"])
-def test_ids_that_gymnasium_does_not_know_are_explained(env_id):
-    remedy = "pass the environment itself, or import the package"
-    with pytest.raises(ValueError, match=f"env='{env_id}' is no id that Gymnasium knows .*: {remedy}"):
-        MADDPG("MlpPolicy", env_id)
+@pytest.mark.parametrize("take", [lambda env_id: MADDPG("MlpPolicy", env_id), make_vec_env])
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("my_envs/x", "no module my_envs.x with a function parallel_env"),
+        ("Nowhere-v7", "have to be imported first"),
+        ("CartPole-v9", "did you mean 'CartPole-v1'?"),
+        ("mpe2/simple_tig_v3", "did you mean 'mpe2/simple_tag_v3'?"),
+        ("pettingzoo/utils/wrappers/base", "base.py has no function parallel_env"),
+    ],
+)
+def test_unknown_ids_are_explained(take, env_id, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        take(env_id)
 
 
 def test_actions_by_agent_are_no_joint_action():

@@ -38,5 +38,5 @@ def test_each_copy_may_have_a_process():
 def test_an_environment_itself_is_not_enough():
     with pytest.raises(ValueError, match="pass what creates an environment, not an environment"):
         make_vec_env(Toy("binary"))
-    with pytest.raises(ValueError, match="Did you mean 'mpe2/simple_spread_v3'"):
+    with pytest.raises(ValueError, match="did you mean 'mpe2/simple_spread_v3'"):
         make_vec_env("mpe2/simple_sprad_v3")
