@@ -848,7 +848,8 @@ def _remedy_for_other_team() -> Iterator[None]:
             raise
         raise InvalidEnvironmentError(
             f"{error}. A model fits only the team it was trained for (the first space is the model's): create the "
-            "environment with the same arguments, see `MADDPG.load(path).env_spec`, or train a new model."
+            "environment with the same arguments (`MADDPG.load(path).env_spec`, if an id created it), or train a new "
+            "model."
         ) from error
 
 
