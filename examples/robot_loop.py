@@ -35,9 +35,13 @@ STARTS, GOALS = np.array([[-2.0, 0, 1.5], [2.0, 0.1, 1.5]]), np.array([[2.0, 0, 
 
 
 class MyVehicle:
-    """A simulated vehicle, which flies the last set-point until the next one."""
+    """A simulated vehicle, which flies the last set-point until the next one.
+
+    Your class is created with the same arguments: number of the robot, its world, and --shared, None without."""
 
     def __init__(self, index, config, shared):
+        if shared is None:
+            raise SystemExit("--shared: MyVehicle simulates, and needs the file; replace it by your vehicle's class")
         self.index, self.model, self.setpoint = index, QuadrotorModel(config.quadrotor, 0.01), np.zeros(4)
         self.states = np.memmap(shared, float, "r+", shape=(config.n_robots, 9))
         self.stamp, self.flies = monotonic(), True
@@ -73,24 +77,31 @@ def make_robot(index, n_robots, folder, rule):
     return Robot(config, index, RulePolicy(rule))
 
 
+def check_team(addresses, config):
+    """Refuse starts and goals that are not one for each robot, in the workspace, and apart."""
+    if not len(addresses) == len(STARTS) == len(GOALS) == config.n_robots:
+        counts = f"{len(addresses)} addresses, {len(STARTS)} STARTS and {len(GOALS)} GOALS"
+        raise ValueError(f"{counts} for {config.n_robots} robots; edit STARTS and GOALS in {__file__}")
+    config.check_flight(STARTS, GOALS, config.obstacles.listed)
+
+
 def fly(index, addresses, begins, duration, folder, rule, shared):
     """Fly one robot to its goal from the time of the day at which all begin (us) on, and land after some time (s).
 
     Return why it landed before, None if it did not."""
     try:
         robot = make_robot(index, len(addresses), folder, rule)
+        check_team(addresses, robot.config)
     except ValueError as error:
         raise SystemExit(f"robot {index}: {error}") from None
     config = robot.config
-    if not len(addresses) == len(STARTS) == len(GOALS) == config.n_robots:
-        counts = f"{len(addresses)} addresses, {len(STARTS)} STARTS and {len(GOALS)} GOALS"
-        raise SystemExit(f"{counts} for {config.n_robots} robots")
     (host, port), others = addresses[index], {k: a for k, a in enumerate(addresses) if k != index}
     link = UdpLink(index, others, host, port, session=7)  # a session that all share
     vehicle = MyVehicle(index, config, shared)
     # For your room: fence, braking and radius must fit between workspace and wall. Below the separation, here halfway
     # between contact and what planners keep, robots hold their places. At the height `ground`, your vehicle stands.
     limits = SafetyLimits(fence=0.3, separation=config.radius + config.planner.separation / 2, ground=0.1)
+    # `late=` is when set-points act, in periods: measure it, from the start of a period to the motion (0.25 is 12.5 ms)
     loop = Loop(robot, link, vehicle, limits)
     loop.warm_up()  # the first time on a machine, it compiles the planner
     freeze_garbage()
@@ -155,7 +166,7 @@ def fly_all(duration, folder, rule):
     with tempfile.TemporaryDirectory() as motion_capture:
         shared = Path(motion_capture) / "states"
         np.hstack([STARTS, np.zeros((len(STARTS), 6))]).tofile(shared)
-        words = ["--addresses", *addresses, "--begins", str(time.time_ns() // 1000 + 10_000_000)]
+        words = ["--addresses", *addresses, "--begins", str(time.time_ns() // 1000 + 20_000_000)]
         words += ["--duration", str(duration), "--shared", str(shared)]
         words += [word for name, value in (("--files", folder), ("--rule", rule)) if value for word in (name, value)]
         command = [sys.executable, __file__]
@@ -193,6 +204,4 @@ if __name__ == "__main__":
         parser.error("--index needs --addresses, --begins, and --files (or --rule, in the world flight-v2)")
     if not 0 <= args.index < len(args.addresses):
         parser.error(f"--index {args.index}: there are {len(args.addresses)} addresses, from 0")
-    if args.shared is None:
-        parser.error("--shared: MyVehicle simulates, and needs the file; replace it by the class of your vehicle")
     sys.exit(fly(args.index, args.addresses, args.begins, args.duration, args.files, args.rule, args.shared))

@@ -2,16 +2,20 @@
 
 import importlib.util
 import os
+import re
+import runpy
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch as th
 from mpe2 import simple_spread_v3
 from network import alone
 
+from quad_swarm.world.presets import make_config
 from reference import drawn
 from sb3_maddpg import MADDPG
 
@@ -46,6 +50,21 @@ def test_a_robot_lands_at_ctrl_c(tmp_path):
     said = process.communicate(timeout=500)[0]
     assert process.returncode == 0
     assert said.count("landed") == 2
+
+
+@pytest.mark.parametrize(
+    ("goals", "message"),
+    [
+        ([[9.0, 9, 9], [-2, 0, 1.5]], "goals[0]=[9.0, 9.0, 9.0] is 8.88 m outside the workspace"),
+        ([[2.0, 0, 1.5], [2, 0.1, 1.5]], "cannot be at both goals"),
+        ([[2.0, 0, 1.5]], "2 addresses, 2 STARTS and 1 GOALS for 2 robots; edit STARTS and GOALS in"),
+    ],
+)
+def test_a_robot_refuses_goals_that_no_team_can_fly_to(goals, message):
+    names = runpy.run_path(str(EXAMPLES / "robot_loop.py"))
+    names["check_team"].__globals__["GOALS"] = np.array(goals)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        names["check_team"]([("10.0.0.1", 1), ("10.0.0.2", 1)], make_config("flight-v2", n_robots=2))
 
 
 @pytest.mark.slow
