@@ -126,7 +126,8 @@ def test_the_nearest_of_what_is_mistyped_is_named(argv, nearest, capsys):
     ("argv", "message"),
     [
         (["evaluate", "--policy", "latst:logs"], "Did you mean 'latest'?"),
-        (["train", "--env", "mpe/simple_spread_v3"], "Did you mean 'mpe2'?"),
+        (["train", "--env", "mpe/simple_spread_v3"], "Did you mean 'mpe2/simple_spread_v3'?"),
+        (["train", "--env", "mpe/mine_v0"], "Did you mean 'mpe2'?"),
         (["train", "--env", "OwnBit-v0", "--conf-file", "my_recipe.yml"], "Did you mean 'my_recipes.yml'?"),
         (["train", "--env", "QuadSwarm-v0", "--conf-file", "quad_swarm_papr.yml"], "'quad_swarm_paper.yml'?"),
     ],

@@ -162,7 +162,7 @@ def test_flat_observations_are_numbers():
 def test_an_environment_is_named_or_created():
     model = MADDPG("MlpPolicy", "mpe2/simple_spread_v3", **SMALL)
     assert model.env.num_envs == 1
-    meant = r"no environment '{}'. Did you mean 'mpe2/simple_spread_v3'\?$"
+    meant = r"Unknown environment '{}'[.:] [Dd]id you mean 'mpe2/simple_spread_v3'\?$"
     with pytest.raises(ValueError, match=meant.format("mpe2/simple_sprad_v3")):
         MADDPG("MlpPolicy", "mpe2/simple_sprad_v3")
     with pytest.raises(ValueError, match=meant.format("mpe/simple_spread_v3")):
