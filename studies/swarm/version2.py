@@ -6,8 +6,8 @@ nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios 
 ``crazyflie`` (the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and
 ``crowd`` (full communication of sixteen) in all scenarios; set 702 ``identified``, RotorPy's Hummingbird with its own
 model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five times as often;
-set 704 the same of four, twelve and sixteen (``four_again``, ``twelve_again``, ``crowd_again``); set 705
-``one_small`` and ``one_large``, one model of version 1 at one threshold, with four to sixteen robots; set 706
+set 704 the same of four, twelve and, without obstacles, sixteen (``four_again``, ``twelve_again``, ``crowd_again``);
+set 705 ``one_small`` and ``one_large``, one model of version 1 at one threshold, with four to sixteen robots; set 706
 ``safe_small`` and ``safe_large``, the same model at a lower threshold, and ``among_four``, ``among_eight``,
 ``among_twelve`` and ``among_sixteen``, full communication and that model among obstacles, after these had been given a
 larger penalty than robots; set 707 ``trained_four``, ``trained_eight``, ``trained_twelve`` and ``trained_sixteen``, the
