@@ -78,7 +78,8 @@ _FIELDS: dict[str, dict[str, Any]] = {
         "right_of_way": _real(0, 2), "violation_weight": _real(1e-2, 1e6), "max_neighbours": _whole(1, 8),
         "max_obstacles": _whole(1, 12), "downwash": _real(1, 20), "max_descent_rate": _real(1e-6, 1e4),
         "max_descent_speed": _real(1e-3, 1e3), "cruise_distance": _real(1e-2, 1e3), "commitment": _real(0, 1e4),
-        "commitment_fade": _real(0, 100), "disturbance_time": _real(1e-3, 1e4),
+        "commitment_fade": _real(0, 100), "disturbance_time": _real(1e-3, 1e4), "obstacle_penalty": _real(1, 1e3),
+        "braking_reserve": _real(0, 10), "prediction_penalty": _real(1e-3, 1),
     },
     "space": {
         "half_width": _real(0.1, 1e4), "heights": _range(-1e4, 1e4), "spacing": _real(0, 5),

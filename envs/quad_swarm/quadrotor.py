@@ -12,6 +12,7 @@ commands with first-order lags.
 from __future__ import annotations
 
 import functools
+import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -70,6 +71,11 @@ class QuadrotorParams:
         """Longest step (s) for which `rk4_step` is stable: its stability interval divided by the fastest decay rate."""
         lags = (1 / self.roll_time_constant, 1 / self.pitch_time_constant, 1 / self.climb_time_constant)
         return 2.785 / max(self.drag_x, self.drag_y, *lags)
+
+    def deceleration(self, tilt: float) -> float:
+        """Return with what acceleration a vehicle can brake at a commanded tilt (rad), without drag and along the axis
+        that answers less (m/s^2)."""
+        return self.gravity * math.tan(tilt * min(self.roll_gain, self.pitch_gain))
 
     def drift(self, time: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return by how much an acceleration of 1 m/s^2 beside those of the model changes the position (m) and the

@@ -355,11 +355,15 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
     :param owner: the dataclass or function that was called
     :param path: path of the owner in the user's arguments
     """
-    errors = error.errors(include_url=False)
+    unknown = ("unexpected_keyword_argument", "unexpected_positional_argument")
+    # A mistyped name first, since what it was to be is missing too
+    errors = sorted(error.errors(include_url=False), key=lambda each: each["type"] not in unknown)
     place, value = errors[0]["loc"], errors[0]["input"]
-    if errors[0]["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
+    if errors[0]["type"] in unknown:
         *parents, name = map(str, place)
         where = ".".join((*path, *parents))
+        if ":" in name and value is None:
+            return ValueError(f"{shown(name)} needs a blank after the colon: {name.replace(':', ': ', 1)}")
         kind = f"{where or owner.__name__} parameter" if isinstance(owner, type) else "argument"
         if isinstance(owner, type) and not parents and (deeper := _deeper(owner, name)):
             return ValueError(f"Unknown {kind} {shown(name)}: did you mean {' or '.join(deeper)}?")
@@ -377,7 +381,9 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         return ValueError(
             problem if problem.endswith(("?", ".")) else f"{problem}."
         )  # from `__post_init__`, which names the conflicting fields
-    if errors[0]["type"] == "missing":  # in a tuple
+    if errors[0]["type"] == "missing":
+        if isinstance(place[-1], str):
+            return ValueError(f"{name} is missing in {shown(value)}.")
         name, problem = name.rpartition(".")[0], "it has too few entries"
     return ValueError(f"{name}={shown(value)}: {problem}.")
 

@@ -62,7 +62,7 @@ def parse_value(text: str) -> Any:
         if text[0] not in "[{":
             raise error
     try:
-        return _finite(yaml.load(text, BoundedLoader))
+        return _complete(_finite(yaml.load(text, BoundedLoader)))
     except (yaml.YAMLError, RecursionError):
         raise ValueError(f"{shown(text)} is neither a list nor a dict, in Python or in YAML") from None
 
@@ -162,6 +162,17 @@ def _finite(value: Any) -> Any:
         contents = list(value) if isinstance(value, (list, tuple)) else []
     for one in contents:
         _finite(one)
+    return value
+
+
+def _complete(value: Any) -> Any:
+    """:return: the value, if no colon in it lacks its blank, which YAML reads as a part of the key"""
+    if isinstance(value, dict):
+        for key, one in value.items():
+            if one is None and isinstance(key, str) and ":" in key:
+                raise ValueError(f"{shown(key)} needs a blank after the colon: {key.replace(':', ': ', 1)}")
+    for one in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _complete(one)
     return value
 
 

@@ -379,6 +379,11 @@ class Training:
         if model.ep_info_buffer:
             rewards = [episode["r"] for episode in model.ep_info_buffer]
             print(f"Mean reward: {safe_mean(rewards):.4g} in the last {len(rewards)} episodes of training")
+        if isinstance(model, OffPolicyAlgorithm) and not model._n_updates:
+            print(
+                f"Nothing was learned: learning_starts={model.learning_starts}, and there were {model.num_timesteps} "
+                "steps. Train for more (-n), or start earlier (-params learning_starts:...)."
+            )
         print(f"Model:       {path}")
         print(f"Logs:        {self.folder}")
         if self.curves:

@@ -110,8 +110,7 @@ class OrcaSolver:
         config, vehicle = self.problem.config, self.problem.quadrotor
         way = problems.goal - problems.x[:, POSITION]
         distance = length(way)
-        tilt = config.max_tilt * min(vehicle.roll_gain, vehicle.pitch_gain)
-        stopping = np.sqrt(vehicle.gravity * math.tan(tilt) * distance)
+        stopping = np.sqrt(vehicle.deceleration(config.max_tilt) * distance)
         speed = np.minimum(np.minimum(self.speed, stopping), distance / self.settling)
         return way * (speed / np.maximum(distance, _SMALL))[:, None]
 

@@ -67,6 +67,9 @@ class PlannerConfig:
         others and obstacles together that its last plan comes closest to
     :param obstacle_penalty: how many times as much violations of the distance to obstacles cost as those of the
         distance to robots, see `Problems.penalty` (-). An obstacle is where it is believed to be, and does not give way
+    :param braking_reserve: how much further a robot keeps from obstacles that it flies toward, as a share of its
+        braking distance v^2 / 2a at the speed of approach v and the deceleration a at ``max_tilt`` (-); 0 for the same
+        distance at every speed
     :param prediction_penalty: how many times as much as those of the distance to robots with known plans violations of
         the distance to robots cost whose motion is predicted from their velocity (-)
     :param downwash: height over width of the ellipsoid around another robot that robots keep out of, because of the air
@@ -105,6 +108,7 @@ class PlannerConfig:
     max_neighbours: PositiveInt | None = None
     max_obstacles: PositiveInt = 12
     obstacle_penalty: Annotated[float, Field(ge=1, le=1e3)] = 1.0
+    braking_reserve: Annotated[float, Field(ge=0, le=10)] = 0.0
     prediction_penalty: Annotated[float, Field(ge=1e-3, le=1)] = 1.0
     downwash: Annotated[float, Field(ge=1, le=20)] = 1.0
     cruise_distance: PositiveLength | None = None

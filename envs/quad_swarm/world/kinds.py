@@ -92,6 +92,7 @@ class Bodies(NamedTuple):
     :param radius: radii of the robots, (n,) (m)
     :param separation: distance between centres that each of them keeps from another of its own radius, (n,) (m)
     :param clear: distance that each of them keeps between its centre and the surfaces of obstacles, (n,) (m)
+    :param deceleration: with what acceleration each of them can brake, (n,) (m/s^2)
     :param others: radii of the others, (n, n - 1) or (E, n, n - 1) (m)
     :param larger: how much larger than the robot each of the others is, in the shape of ``others`` (m); None if all
         robots of the team are equally large
@@ -101,6 +102,7 @@ class Bodies(NamedTuple):
     radius: np.ndarray
     separation: np.ndarray
     clear: np.ndarray
+    deceleration: np.ndarray
     others: np.ndarray
     larger: np.ndarray | None = None
     excess: np.ndarray | None = None
@@ -122,6 +124,7 @@ def bodies_of(config: SwarmConfig, robot: int | None = None, others: np.ndarray 
         radii[robots],
         config.per_robot(lambda kind: kind.planner.separation)[robots],
         config.per_robot(lambda kind: kind.radius + kind.obstacle_margin)[robots],
+        config.per_robot(lambda kind: kind.quadrotor.deceleration(kind.planner.max_tilt))[robots],
         np.broadcast_to(radii[0], others.shape) if same else radii[others],
         None if same else radii[others] - radii[robots][:, None],
         None if config.excess is None else config.excess[rows, others],

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from quad_swarm.geometry import dot, length
 from quad_swarm.native.pairs import resample
 from quad_swarm.planner import Problems
-from quad_swarm.quadrotor import VehicleModel
+from quad_swarm.quadrotor import POSITION, VELOCITY, VehicleModel
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
 from quad_swarm.world.commitment import Commitment
 from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
@@ -24,6 +25,7 @@ from quad_swarm.world.presets import SwarmConfig
 # Distance (in separations) from which an observation contradicts a plan that arrives: who keeps apart from the plan
 # keeps less than half of it from the robot. In "flight-hard", plans are up to 0.15 m off, less than a fifth
 _MISFIT = 0.5
+_SMALL = 1e-9  # length of vectors without a direction (m)
 
 
 class SeenByOthers(NamedTuple):
@@ -193,9 +195,8 @@ def _among(
     planner, (n_swarms, k) = config.planner, obstacles.radius.shape
     count, m = problems.others.shape[:2]
     n = count // n_swarms
-    times = np.broadcast_to(planner.dt * np.arange(1.0, planner.horizon + 1), (n_swarms, n, planner.horizon))
-    if late is not None:
-        times = times + planner.dt * late[..., None]
+    start = np.zeros((n_swarms, n)) if late is None else planner.dt * late
+    times = start[..., None] + planner.dt * np.arange(1.0, planner.horizon + 1)
     expected = obstacles.ahead(times).reshape(count, k, planner.horizon, 3)
     shape, size = np.ones((n_swarms, n, m + k, 3)), np.zeros((n_swarms, n, m + k))
     shape[..., :m, 2] = 1 / planner.downwash
@@ -203,6 +204,9 @@ def _among(
     if bodies.larger is not None:
         size[..., :m] = bodies.larger
     size[..., m:] = obstacles.radius[:, None] + bodies.clear[:, None] - bodies.separation[:, None]
+    if planner.braking_reserve:
+        x = problems.x.reshape(n_swarms, n, -1)
+        size[..., m:] += planner.braking_reserve * _braking_distances(obstacles, x, start, bodies)
     announced = problems.announced
     if announced is not None:
         announced = np.concatenate([announced, np.zeros((count, k), bool)], axis=1)
@@ -217,3 +221,18 @@ def _among(
         size=size.reshape(count, m + k),
         penalty=penalty,
     )
+
+
+def _braking_distances(obstacles: Obstacles, x: np.ndarray, start: np.ndarray, bodies: Bodies) -> np.ndarray:
+    """Return the distances in which robots can stop that fly toward obstacles, (E, n, K) (m), 0 for those that do not.
+
+    :param obstacles: obstacles
+    :param x: states, (E, n, 9)
+    :param start: times from now at which robots are there, (E, n) (s)
+    :param bodies: how well robots brake
+    """
+    factors = obstacles.factors[:, None]
+    away = factors * (x[:, :, None, POSITION] - obstacles.ahead(start[..., None])[..., 0, :])
+    relative = factors * (x[:, :, None, VELOCITY] - obstacles.velocity[:, None])
+    approach = np.maximum(-dot(away, relative) / np.maximum(length(away), _SMALL), 0.0)
+    return approach**2 / (2 * bodies.deceleration[:, None])

@@ -28,8 +28,9 @@ Scenario = Callable[[int, "ScenarioSpace", Rng], "tuple[np.ndarray, np.ndarray] 
 
 _DRAWS_PER_POINT = 100  # before the whole set is redrawn
 _MAX_DRAWS = 20_000
-_MOST_ATTEMPTS = 100  # draws of a whole episode
+_MOST_ATTEMPTS = 500  # draws of a whole episode
 _TRIALS = 8  # episodes that are tried before the first one
+_TRIALS_AMONG_OBSTACLES, _FEWEST = 40, 4  # and how many of these must succeed
 _DRAWS_PER_OBSTACLE = 30
 _FREE = 0.6  # distance of obstacles from starts and goals, in the distance of obstacles from each other
 _POST = 1.25  # radius of the pillars beside a doorway (m)
@@ -500,18 +501,25 @@ class ScenarioSampler:
         )
 
     def _try_obstacles(self, name: str) -> None:
-        """Check that about half of the attempts to draw an episode among the world's obstacles succeed.
+        """Check that about a tenth of the attempts to draw an episode among the world's obstacles succeed.
 
         :raises ValueError: if they do not
         """
-        failed = 0
-        for seed in range(_TRIALS):
+        found, last = 0, ""
+        for seed in range(_TRIALS_AMONG_OBSTACLES):
             try:
                 self._attempt(name, np.random.default_rng(seed))
-            except ValueError:
-                failed += 1
-                if 2 * failed > _TRIALS:
-                    raise
+            except ValueError as error:
+                last = str(error)
+            else:
+                found += 1
+                if found == _FEWEST:
+                    return
+        raise DoesNotFit(
+            f"{self.n_robots} robots of scenario={name!r} and the world's obstacles: {found} of "
+            f"{_TRIALS_AMONG_OBSTACLES} drawn episodes have room for both. Choose fewer robots or obstacles, smaller "
+            f"obstacles, or a larger space.half_width if the workspace allows it. What the last one lacked: {last}"
+        )
 
     def _attempt(self, name: str, rng: Rng) -> Scene:
         """Draw an episode once.

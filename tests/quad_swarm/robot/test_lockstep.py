@@ -110,6 +110,12 @@ def test_unlike_robots_fly_as_the_swarm(preset, scenario, rule):
     assert not list(differences(config, [RulePolicy(rule) for _ in range(4)], rule, scenario))
 
 
+@pytest.mark.parametrize("vehicles", [[], UNLIKE])
+def test_robots_that_brake_early_fly_as_the_swarm(vehicles):
+    config = make_config("flight-v2", {"vehicles": vehicles, "planner": {"braking_reserve": 0.5}}, n_robots=4)
+    assert not list(differences(config, [RulePolicy("full") for _ in range(4)], "full", "crossing_traffic"))
+
+
 @pytest.mark.parametrize("rule", ["full", "stage:1.0:0.2"])
 def test_unlike_robots_that_estimate_and_keep_to_what_they_told_fly_as_the_swarm(rule):
     planner = {"commitment": 3.0, "disturbance_time": 1.0, "max_descent_rate": 0.5}

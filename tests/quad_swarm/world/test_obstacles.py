@@ -17,7 +17,7 @@ from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly_st
 from quad_swarm.task.episode_statistics import is_row
 from quad_swarm.world.obstacles import Obstacle, Obstacles, clearances, surroundings
 from quad_swarm.world.presets import for_scenario, make_config
-from quad_swarm.world.scenarios import MOST_OBSTACLES, SCENARIOS, ScenarioSampler, ScenarioSpace
+from quad_swarm.world.scenarios import MOST_OBSTACLES, SCENARIOS, DoesNotFit, ScenarioSampler, ScenarioSpace
 from quad_swarm.world.swarm import Swarm
 from sb3_maddpg.common.callbacks import record_metrics
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
@@ -37,6 +37,10 @@ PILLAR, BALL = Obstacle((0.0, 0.0, 5.0), 0.5), Obstacle((1.0, 0.0, 1.0), 0.5, "s
         ({"shape": "cube"}, "shape"),
         ({"listed": [{"position": (0, 0, np.nan), "radius": 1.0}]}, "position"),
         ({"listed": [{"position": (0, 0, 0), "radius": -1.0}]}, "radius"),
+        ({"listed": [{"position": (0, 0, 0)}]}, r"^obstacles\.listed\.0\.radius is missing in \{'position'"),
+        ({"listed": [{"position": (0, 0), "radius": 1.0}]}, r"^obstacles\.listed\.0\.position=.*too few entries"),
+        ({"listed": [{"position": (0, 0, 0), "radus": 1.0}]}, "Did you mean 'radius'"),
+        ({"listed": [{"position": (0, 0, 0), "radius:0.2": None}]}, "needs a blank after the colon: radius: 0.2"),
     ],
 )
 def test_invalid_obstacles_are_refused(world, message):
@@ -106,6 +110,22 @@ def test_starts_and_goals_inside_obstacles_are_refused(starts, goals, message):
     env = QuadSwarmEnv(n_robots=2, world={"obstacles": {"listed": [PILLAR]}})
     with pytest.raises(ValueError, match=message):
         env.reset(options={"starts": starts, "goals": goals})
+
+
+def test_scenarios_draw_again_what_an_obstacle_is_in_the_way_of():
+    world = {"obstacles": {"listed": [{"position": (0, 0, 0), "radius": 0.7}]}}
+    config = make_config("flight", world)
+    sampler, rng = ScenarioSampler("random", config.n_robots, config.space, config), np.random.default_rng(0)
+    for _ in range(50):
+        _, starts, goals, obstacles = sampler.sample(rng)
+        config.check_flight(starts, goals, obstacles)
+        assert np.hypot(*np.concatenate([starts, goals])[:, :2].T).min() >= 0.7 + config.radius
+    world["obstacles"]["listed"][0]["radius"] = 1.5
+    config = make_config("flight", world)
+    with pytest.raises(
+        DoesNotFit, match=r"8 robots of scenario='random' .* 0 of 40 .*half_width.*starts\[0\]=.*1\.\d+ m"
+    ):
+        ScenarioSampler("random", config.n_robots, config.space, config)
 
 
 def test_more_obstacles_than_there_is_room_for_are_refused():

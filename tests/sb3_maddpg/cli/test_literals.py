@@ -123,6 +123,8 @@ def test_pairs_of_a_repeated_option_come_together():
         ("[!!int '']", "neither a list nor a dict"),
         ("[!!bool 1, a b]", "neither a list nor a dict"),
         ("[2001-99-99, a b]", "neither a list nor a dict"),
+        ("[{position: [0, 0], radius:0.2}]", "'radius:0.2' needs a blank after the colon: radius: 0.2"),
+        ("{a: {b:c}}", "'b:c' needs a blank after the colon: b: c"),
     ],
 )
 def test_what_cannot_be_read_is_told_in_one_line(text, told):

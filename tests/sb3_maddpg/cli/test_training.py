@@ -98,6 +98,13 @@ def test_tables_come_at_a_readable_rate_and_short_trainings_log_their_rewards(ca
     assert capsys.readouterr().out.count("ep_rew_mean") > 4  # by episodes
 
 
+def test_a_training_that_ends_before_it_learns_says_so(capsys):
+    assert train("-n", "50", "--verbose", "0") == 0
+    assert "Nothing was learned: learning_starts=50, and there were 50 steps" in capsys.readouterr().out
+    assert train("-n", "60", "--verbose", "0") == 0
+    assert "Nothing was learned" not in capsys.readouterr().out
+
+
 def test_a_progress_bar_stands_alone(capsys):
     assert train("--progress", "-tb", "tb") == 0
     out = capsys.readouterr().out
