@@ -12,10 +12,11 @@ set 705 ``one_small`` and ``one_large``, one model of version 1 at one threshold
 ``among_twelve`` and ``among_sixteen``, full communication and that model among obstacles, after these had been given a
 larger penalty than robots; set 707 ``trained_four``, ``trained_eight``, ``trained_twelve`` and ``trained_sixteen``, the
 packaged model, which was trained in version 2 and with obstacles; set 708 ``seeds_four``, ``seeds_eight``,
-``seeds_twelve`` and ``seeds_sixteen``, its recipe with other training seeds, at its threshold. All parts before set 706
-fly with equal penalties, as they did. JSON: one row per
-policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run that is ended
-keeps what it has.
+``seeds_twelve`` and ``seeds_sixteen``, its recipe with other training seeds, at its threshold; set 709
+``braking_learned``, ``braking_full``, ``braking_twelve`` and ``braking_sixteen``, full communication and the packaged
+model among obstacles with the braking reserve. All parts before set 706 fly with equal penalties, those before set 709
+without the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`;
+written after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from studies.swarm.experiment import condition
 from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
-SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS = range(700, 709)
+SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING = range(700, 710)
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -56,7 +57,9 @@ OTHER_SEEDS = tuple(f"{model}@0.4" for model in models("flight_v2"))
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
 CHECKED: dict[str, Any] = {"radio": {"jitter": 0}, "planner": {"commitment": 0.0}}
-ALIKE = {"planner": {"obstacle_penalty": 1.0}}  # of sets up to 705
+# Of sets before 706 and 709
+ALIKE = {"planner": {"obstacle_penalty": 1.0}}
+UNRESERVED = {"planner": {"braking_reserve": 0.0}}
 
 
 class Part(NamedTuple):
@@ -121,6 +124,10 @@ PARTS = {
     "seeds_eight": Part(OTHER_SEEDS, EVERYWHERE, (8,), 2000, SEEDS),
     "seeds_twelve": Part(OTHER_SEEDS, EVERYWHERE, (12,), 2000, SEEDS),
     "seeds_sixteen": Part(OTHER_SEEDS, EVERYWHERE, (16,), 2000, SEEDS),
+    "braking_sixteen": Part(("full", OWN_MODEL), tuple(MOST_OBSTACLES), (16,), 2000, BRAKING),
+    "braking_twelve": Part(("full", OWN_MODEL), tuple(MOST_OBSTACLES), (12,), 2000, BRAKING),
+    "braking_learned": Part((OWN_MODEL,), tuple(MOST_OBSTACLES), (8, 4), 2000, BRAKING),
+    "braking_full": Part(("full",), tuple(MOST_OBSTACLES), (8, 4), 4000, BRAKING),
 }
 
 
@@ -134,6 +141,8 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
         config = make_config(world("flight-v2", n), plant=part.plant, quadrotor=part.vehicle)
         if part.set < AMONG:
             config = make_config(config, ALIKE)
+        if part.set < BRAKING:
+            config = make_config(config, UNRESERVED)
         for scenario in part.scenarios:
             flown: dict[str, Rows] = {}
             conditions = [condition(policy, scenario, config) for policy in part.policies if policy != DELAY_CHECK]

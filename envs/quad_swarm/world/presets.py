@@ -573,10 +573,13 @@ PRESETS: dict[str, SwarmConfig] = {
     ),
     "flight": _FLIGHT,
     # Version 2 of `flight`: answers count when they come, and robots hold against wind and payloads, keep to the plans
-    # that they sent, and give way to obstacles before others. See docs/flight.md for what each of these is worth.
+    # that they sent, give way to obstacles before others, and slow down before obstacles. See docs/flight.md for what
+    # each of these is worth.
     "flight-v2": replace(
         _FLIGHT,
-        planner=replace(_FLIGHT.planner, disturbance_time=1.0, commitment=1.0, obstacle_penalty=30.0),
+        planner=replace(
+            _FLIGHT.planner, disturbance_time=1.0, commitment=1.0, obstacle_penalty=30.0, braking_reserve=0.15
+        ),
         radio=Radio(loss=0.1, round_trip=0, jitter=1),
     ),
     # The same team without motion capture and in more wind: errors two to four times as large, interrupted links, and
