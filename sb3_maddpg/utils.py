@@ -76,9 +76,8 @@ def suggest(kind: str, name: Any, known: Iterable[str]) -> str:
     :return: the message
     """
     known, name = sorted(known), name if isinstance(name, str) else shown(name)
-    nearest = difflib.get_close_matches(name, known, n=1)
-    if nearest:
-        return f"Unknown {kind} '{name[:100]}': did you mean '{nearest[0]}'?"
+    if nearest := _nearest(name, known, cutoff=0.6):
+        return f"Unknown {kind} '{name[:100]}': did you mean '{nearest}'?"
     return f"Unknown {kind} '{name[:100]}'. Choose one of: {', '.join(known)}."
 
 
@@ -89,8 +88,15 @@ def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.7) -> str:
     :param cutoff: minimum similarity, see ``difflib``
     :return: a question about the closest known name, to append to a message; empty if there is none
     """
-    nearest = difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
-    return f" Did you mean '{nearest[0]}'?" if nearest else ""
+    nearest = _nearest(name, known, cutoff)
+    return f" Did you mean '{nearest}'?" if nearest else ""
+
+
+def _nearest(name: str, known: Iterable[str], cutoff: float) -> str | None:
+    """:return: the closest known name, in whichever case, None if there is none"""
+    names = {one.lower(): one for one in known}
+    nearest = difflib.get_close_matches(name.lower(), list(names), n=1, cutoff=cutoff)
+    return names[nearest[0]] if nearest else None
 
 
 def modules_beside(name: str) -> set[str]:

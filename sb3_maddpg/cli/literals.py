@@ -6,6 +6,7 @@ import ast
 import importlib
 import itertools
 import math
+from collections import Counter
 from typing import Any
 
 import yaml
@@ -217,6 +218,14 @@ class BoundedLoader(yaml.SafeLoader):
         if self.flow_level > _DEEPEST:  # the time of the scanner grows with the square
             raise RecursionError
         super().fetch_flow_collection_start(token)
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        names = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        if twice := [name for name, count in names.items() if count > 1 and name != "<<"]:
+            where = "" if self.name.startswith("<") else f"{self.name}: "  # text of a command line has no name
+            raise Refused(f"{where}{shown(twice[0])} is given twice")
+        return node
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()

@@ -75,7 +75,7 @@ class StoreValues(argparse.Action):
             for word in values:
                 key, _, value = word.partition(":")
                 if not key or not value:
-                    raise ValueError(f"'{word}' has no value")
+                    raise ValueError("it has no value" if len(values) == 1 else f"'{word}' has no value")
                 if key in pairs:
                     raise ValueError(f"'{key}' is given twice")
                 pairs[key] = parse_value(value)

@@ -177,7 +177,10 @@ def recipe_path(name: str | None, algo: str, env_id: str) -> str:
     path = packaged.get(f"{algo}.yml")
     if path is not None and not {env_id, "default"}.isdisjoint(yaml.safe_load(path.read_text())):
         return str(path)
-    raise InvalidArgumentError(f"There is no packaged recipe of {algo} for {env_id}: pass --conf-file FILE.")
+    raise InvalidArgumentError(
+        f"There is no packaged recipe of {algo} for {env_id}: pass --conf-file FILE with one, for example "
+        f"`{env_id}: {{n_timesteps: 100000, policy: MlpPolicy}}`."
+    )
 
 
 def read_recipe(path: str, algo: str, env_id: str) -> dict[str, Any]:

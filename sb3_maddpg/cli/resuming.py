@@ -59,7 +59,7 @@ def resumed(asked: argparse.Namespace, words: list[str]) -> tuple[Path, argparse
     run = _run(asked)
     path = _settings(run, "args.yml")
     if newest(run / CHECKPOINTS) is None:
-        raise InvalidFileError(f"{run} has no complete checkpoint.")
+        raise InvalidFileError(without_checkpoint(run))
     given = vars(parsed(words, given_only=True))
     written = {key: value for key, value in read_settings(path).items() if key in _KEPT and key not in given}
     args = _merged(written, words, path)
@@ -143,7 +143,19 @@ def _run(asked: argparse.Namespace) -> Path:
     return max(runs, key=lambda path: path.stat().st_mtime)
 
 
+def without_checkpoint(run: Path) -> str:
+    """
+    :param run: folder of a run that has no complete checkpoint
+    :return: the message that says so, and how to train a finished run's model further
+    """
+    if finished := [path for path in run.glob("*.zip") if (run / path.stem).is_dir()]:
+        return f"{run} is finished and has no checkpoints: train its model further with `train -i {finished[0]} ...`."
+    return f"{run} has no complete checkpoint: begin again, without --resume."
+
+
 def _settings(run: Path, name: str) -> Path:
+    if not run.is_dir():
+        raise InvalidArgumentError(f"--resume {shown(str(run))}: there is no such folder; name that of a run.")
     found = sorted(run.glob(f"*/{name}"))
     if len(found) != 1:
         raise InvalidArgumentError(f"{run} is not the folder of a run with checkpoints (it has {len(found)} {name}).")

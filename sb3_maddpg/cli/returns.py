@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from sb3_maddpg.cli.algorithms import ALGORITHMS, SINGLE_AGENT, algorithm
 from sb3_maddpg.cli.environments import STATISTICS, Environments, find_environment
-from sb3_maddpg.cli.options import PROG, StoreValues, check_writable, integer
+from sb3_maddpg.cli.options import PROG, StoreValues, check_writable, files_beside, integer
 from sb3_maddpg.cli.overview import load_environments
 from sb3_maddpg.cli.parameter_sharing import shares_parameters
 from sb3_maddpg.cli.parser import Parser
@@ -31,7 +31,7 @@ from sb3_maddpg.cli.terminal import aligned
 from sb3_maddpg.common.evaluation import Episode, compare, play, summarise
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError, TeamError
-from sb3_maddpg.utils import shown
+from sb3_maddpg.utils import did_you_mean, shown
 
 RANDOM = "random"
 EXAMPLES = f"""\
@@ -154,7 +154,10 @@ def _policy(word: str, algo: str, env_id: str) -> Policy:
     own = prefix if name is not word else algo
     path = Path(model_path(name, own, env_id))
     if not path.is_file():
-        raise FileNotFoundError(f"{word}: there is no file {path}. A policy is MODEL.zip, latest:LOGDIR or {RANDOM}.")
+        raise FileNotFoundError(
+            f"There is no file {shown(str(path))}. A policy is MODEL.zip, latest:LOGDIR or {RANDOM}."
+            f"{did_you_mean(word, [RANDOM, *files_beside(str(path), '*.zip')])}"
+        )
     return Policy(word, own, path)
 
 

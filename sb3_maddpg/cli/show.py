@@ -246,7 +246,10 @@ def _model_path(run: Path, name: str, args: argparse.Namespace) -> tuple[Path, s
             raise FileNotFoundError(f"No checkpoint found for {args.algo} on {name} in {run}.")
         path, title = steps[max(steps)], f"checkpoint-{max(steps)}"
     if not path.is_file():
-        raise FileNotFoundError(f"No model found for {args.algo} on {name}, path: {path}")
+        raise FileNotFoundError(
+            f"No model found for {args.algo} on {name}: there is no {path}. Train one with `train --algo {args.algo} "
+            f"--env {args.env} -f {args.folder}`, or name its folder with -f, its run with --exp-id."
+        )
     return path, title
 
 

@@ -40,14 +40,14 @@ from sb3_maddpg.cli.environments import STATISTICS, is_stochastic
 from sb3_maddpg.cli.experiment import Experiment, begin, given_recipe, merged
 from sb3_maddpg.cli.options import ENGINES
 from sb3_maddpg.cli.recipe import callbacks_of
-from sb3_maddpg.cli.resuming import recipe_of, resumed
+from sb3_maddpg.cli.resuming import recipe_of, resumed, without_checkpoint
 from sb3_maddpg.cli.runs import CHECKPOINTS, claim_folder, latest_number
 from sb3_maddpg.cli.safety import write_settings
 from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.common.callbacks import DashboardCallback, check_drawn, check_layout
 from sb3_maddpg.common.evaluation import MEAN_REWARD, TeamEvalCallback
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
-from sb3_maddpg.errors import InvalidArgumentError
+from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
 from sb3_maddpg.files.model_files import not_ours, refuse_pickled, trusted
 from sb3_maddpg.maddpg.maddpg import MADDPG
 from sb3_maddpg.offers import broken, load_offer, offer_named, package_of
@@ -218,11 +218,6 @@ class Training:
                 args.n_eval_envs, experiment.eval_env_kwargs, evaluates=True, statistics=self._statistics()
             )
             team = issubclass(experiment.algorithm, TeamAlgorithm)
-            if args.best_by != MEAN_REWARD and args.eval_freq > experiment.n_timesteps:
-                raise InvalidArgumentError(
-                    f"--best-by {args.best_by} needs evaluations, but this training of {experiment.n_timesteps} steps "
-                    f"has none: pass an --eval-freq below {args.eval_freq}."
-                )
             if args.best_by != MEAN_REWARD and not team:
                 raise InvalidArgumentError(f"--best-by is for teams' algorithms, not for --algo {args.algo}.")
             kind: Any = partial(TeamEvalCallback, best_by=args.best_by) if team else EvalCallback
@@ -235,6 +230,11 @@ class Training:
                 eval_freq=max(args.eval_freq // per_call, 1),
                 deterministic=not is_stochastic(args.env),
             )
+            if args.best_by != MEAN_REWARD and args.eval_freq > experiment.n_timesteps:
+                raise InvalidArgumentError(
+                    f"--best-by {args.best_by} needs evaluations, but this training of {experiment.n_timesteps} steps "
+                    f"has none with --eval-freq {args.eval_freq}: pass at most {experiment.n_timesteps}."
+                )
             found.append(evaluation)
         if self.curves is not None:
             draw, layout = _dashboard(args.env, experiment.eval_env_kwargs)
@@ -263,7 +263,7 @@ class Training:
             warnings.filterwarnings("ignore", ".* logs to ")  # the command says where curves go
             found = resume(self.folder / CHECKPOINTS, cast(Any, env), algorithm, self.every, device=self.args.device)
         if found is None:
-            raise ValueError(f"{self.folder} has no complete checkpoint.")
+            raise InvalidFileError(without_checkpoint(self.folder))
         model, self.checkpoint = found
         model.tensorboard_log, model.verbose = self.curves, self.args.verbose
         print(f"Resuming {self.folder} at step {model.num_timesteps}")
@@ -379,11 +379,6 @@ class Training:
         if model.ep_info_buffer:
             rewards = [episode["r"] for episode in model.ep_info_buffer]
             print(f"Mean reward: {safe_mean(rewards):.4g} in the last {len(rewards)} episodes of training")
-        if isinstance(model, OffPolicyAlgorithm) and not model._n_updates:
-            print(
-                f"Nothing was learned: learning_starts={model.learning_starts}, and there were {model.num_timesteps} "
-                "steps. Train for more (-n), or start earlier (-params learning_starts:...)."
-            )
         print(f"Model:       {path}")
         print(f"Logs:        {self.folder}")
         if self.curves:

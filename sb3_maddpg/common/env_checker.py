@@ -137,7 +137,8 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
     again, _ = env.reset(seed=seed)
     if not np.array_equal(first, again):
         raise InvalidEnvironmentError(
-            f"Two calls of reset(seed={seed}) returned different observations: draw all numbers from self.np_random."
+            f"Two calls of reset(seed={seed}) returned different observations: draw all random numbers from one "
+            "generator, which reset(seed) seeds."
         )
     env.action_space.seed(seed)
     gone = np.zeros(team.n_agents, bool)

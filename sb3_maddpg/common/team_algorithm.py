@@ -640,6 +640,11 @@ class TeamAlgorithm(SavesSafely, SavesReplayBuffer):
         # Log the episodes since SB3's last log, which are all of them in a short training
         if given["log_interval"] and self._episode_num % given["log_interval"]:
             self.dump_logs()
+        if self.verbose and not self._n_updates:
+            print(
+                f"Nothing was learned: learning_starts={self.learning_starts}, and there were {self.num_timesteps} "
+                "steps. Train for more steps, or start earlier."
+            )
         return self
 
     def _seeds_of_env(self) -> Any:

@@ -69,7 +69,8 @@ def opened(path: Any, kind: str = "model", suffix: str | None = None) -> Iterato
     :param kind: what the file should hold
     :param suffix: suffix that the path may lack, as in SB3
     :return: the open file
-    :raises InvalidFileError: if it is neither, or the content raises an error of another library, see ``as_damage``
+    :raises InvalidFileError: if it is neither, or a folder, or the content raises an error of another library, see
+        ``as_damage``
     :raises FileNotFoundError: if there is no such file; the message names a similar one in its folder
     :raises OSError: if it cannot be read
     """
@@ -85,6 +86,8 @@ def opened(path: Any, kind: str = "model", suffix: str | None = None) -> Iterato
                 where = "" if Path(path).is_absolute() else f" (in the folder {os.getcwd()})"
                 text = f"There is no such {kind} file{where}{hint and '.' + hint}"
                 raise FileNotFoundError(error.errno, text, error.filename) from None
+            except IsADirectoryError:
+                raise InvalidFileError(f"{path} is a folder: name a {kind} file in it.") from None
             yield at_end.enter_context(file)
         else:
             path.seek(0)

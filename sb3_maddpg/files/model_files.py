@@ -73,7 +73,8 @@ def read_data(archive: Archive, algorithm: str, readable: set[str]) -> dict[str,
     if written_by is not None and written_by not in list(readable):
         raise InvalidFileError(f"{path} holds a model of {written_by}: load it with `{written_by}.load`.")
     if written_by is None and "policy_regularization" not in data:
-        raise InvalidFileError(f"{path} holds a model of another algorithm than {algorithm}.")
+        what = "a model of another algorithm than" if "policy_class" in data else "no model of"
+        raise InvalidFileError(f"{path} holds {what} {algorithm}.")
     if data.get("file_format", 1) not in _READABLE_FORMATS:
         raise InvalidFileError(
             f"{path} has format {data.get('file_format', 1)}, but this version of sb3-maddpg reads format "

@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_maddpg.errors import InvalidEnvironmentError
 from sb3_maddpg.team.agents import agent_actions, fits, flat
 from sb3_maddpg.team.spaces import TeamObservation, check_action_space, heads_of, joint_action_space
+from sb3_maddpg.team.team import Team
 from sb3_maddpg.utils import as_flag, as_number, as_seed, not_finite_at, shown, told
 
 ENTRY_POINT = f"{__name__}:make"
@@ -500,6 +501,12 @@ class TeamEnv(gymnasium.Env):
     def _warn_of_lost_rewards(self, rewards: Mapping[Any, Any], acted: list[int]) -> None:
         if len(rewards) <= len(acted) or "rewards" in self._warned:
             return
+        if strange := [agent for agent in rewards if agent not in self._rows]:
+            self._warn_once(
+                "rewards",
+                f"{self.parallel_env} returned a reward for {strange[0]!r} {self._when}, which is not in "
+                "possible_agents: it is ignored.",
+            )
         for row, agent in enumerate(self._agents):
             reward: Any = 0.0
             with suppress(ValueError):
@@ -731,6 +738,10 @@ def what_to_pass(env: Any, taker: str) -> str:
             f"pass one of its environments to {taker}; vectorise after that, as in DummyVecEnv([lambda: TeamEnv(env)])"
         )
     if isinstance(env, gymnasium.vector.VectorEnv):
+        try:
+            Team.from_spaces(env.single_observation_space, env.single_action_space)
+        except (ValueError, AttributeError):
+            return "it steps single agents, of which no team is left: pass the PettingZoo environment that was wrapped"
         return "the algorithms take sb3_maddpg.vec_env.GymnasiumVecEnv(env)"
     if isinstance(env, str):
         return "pass the environment itself: what gymnasium.make or a module's parallel_env() returns"
@@ -1012,9 +1023,18 @@ def find_module(name: str) -> ModuleType | None:
         raise InvalidEnvironmentError(f"{name} cannot be imported: {text}{remedy}.") from error
 
 
+def has_environment(module: ModuleType | None) -> bool:
+    """:return: whether a module has what creates a PettingZoo environment"""
+    return _creator(module) is not None
+
+
 def find_parallel_env(entry: str) -> Callable[..., ParallelEnv | AECEnv]:
-    module = find_module(entry)
-    make_env = getattr(module, "parallel_env", None) or getattr(module, "env", None)  # the latter is turn-based
-    if not callable(make_env):
+    make_env = _creator(find_module(entry))
+    if make_env is None:
         raise InvalidEnvironmentError(f"There is no function parallel_env in {entry}: name a module that has one.")
     return make_env
+
+
+def _creator(module: ModuleType | None) -> Callable[..., ParallelEnv | AECEnv] | None:
+    found = (getattr(module, name, None) for name in ("parallel_env", "env"))  # the latter is turn-based
+    return next((one for one in found if callable(one)), None)

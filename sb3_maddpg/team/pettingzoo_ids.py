@@ -1,4 +1,4 @@
-"""Gymnasium ids for PettingZoo modules, which have a function ``parallel_env``."""
+"""Gymnasium ids for PettingZoo modules, which have a function ``parallel_env``, or ``env`` if they are turn-based."""
 
 import difflib
 import importlib.metadata
@@ -6,30 +6,35 @@ import importlib.util
 import inspect
 import pkgutil
 import re
+import sys
 from contextlib import suppress
 
 import gymnasium
 
-from sb3_maddpg.team.pettingzoo import ENTRY_POINT, find_module, find_parallel_env, make
-from sb3_maddpg.utils import did_you_mean, modules_beside, suggest
+from sb3_maddpg.errors import InvalidEnvironmentError
+from sb3_maddpg.team.pettingzoo import ENTRY_POINT, find_module, find_parallel_env, has_environment, make
+from sb3_maddpg.utils import did_you_mean, modules_beside, shown, suggest
 
 
 def register(env_id: str) -> bool:
     """
-    Register a module with a function ``parallel_env`` in Gymnasium. The id "mpe2/simple_spread_v3" stands for
-    ``mpe2.simple_spread_v3``, and "quad_swarm" or "quad_swarm/parallel_env" for a top-level module.
+    Register a module with a function ``parallel_env`` (or ``env``, turn-based) in Gymnasium. The id
+    "mpe2/simple_spread_v3" stands for ``mpe2.simple_spread_v3``, and "quad_swarm" or "quad_swarm/parallel_env" for a
+    top-level module.
 
     :param env_id: Gymnasium id
     :return: whether the id is registered now
-    :raises ValueError: if the module exists but cannot be imported
+    :raises ValueError: if the module exists but cannot be imported, or Gymnasium has no ids of this form
     """
     if env_id in gymnasium.registry:
         return True
     entry = module_of(env_id)
     if not all(part.isidentifier() for part in entry.split(".")):
         return False
-    if not callable(getattr(find_module(entry), "parallel_env", None)):
+    if not has_environment(find_module(entry)):
         return False
+    if "." in env_id.rpartition("/")[0] or env_id.count("/") > 1:
+        raise InvalidEnvironmentError(f"{shown(env_id)} is no id for Gymnasium: write {entry}.")
     # Gymnasium's checker would warn about padding, whose bounds are both zero
     gymnasium.register(env_id, entry_point=ENTRY_POINT, kwargs={"entry": entry}, disable_env_checker=True)
     return True
@@ -67,15 +72,16 @@ def unknown(env_id: str) -> str:
             f"{module.replace('.', '/')}.py has no function parallel_env, which creates a PettingZoo environment: add "
             "one, such as `parallel_env = MyEnv` for a class."
         )
-    if named and (known := packaged(module.rpartition(".")[2])):
+    if named and (known := [one for one in packaged(module.rpartition(".")[2]) if one != env_id]):
         return f"Unknown environment '{env_id}'. Did you mean {' or '.join(map(repr, known))}?"
     package, slash, _ = env_id.rpartition("/")
     ids = siblings(env_id) or list(gymnasium.registry)
     if slash and not any(name.startswith(f"{package}/") for name in ids):
+        near = modules_beside(package) - sys.stdlib_module_names
         return (
             f"Unknown environment '{env_id}': there is no module {env_id.replace('/', '.')} with a function "
             "parallel_env, as PettingZoo's modules have. Is its package installed or in this folder?"
-            f"{did_you_mean(package, modules_beside(package))}"
+            f"{'' if package in near else did_you_mean(package, near)}"
         )
     if difflib.get_close_matches(env_id, ids, n=1):
         return suggest("environment", env_id, ids)
@@ -104,7 +110,7 @@ def packaged(module: str) -> list[str]:
     for package in sorted(packages):
         with suppress(ImportError, ValueError, AttributeError):  # packages may be broken, or need others
             if importlib.util.find_spec(f"{package}.{module}") is not None:
-                ids.append(f"{package.replace('.', '/')}/{module}")
+                ids.append(f"{package}.{module}" if "." in package else f"{package}/{module}")
     return ids
 
 

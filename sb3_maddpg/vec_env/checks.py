@@ -8,7 +8,7 @@ from typing import Any
 from gymnasium import Env, RewardWrapper, spaces
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import NormalizeReward
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from sb3_maddpg.errors import InvalidEnvironmentError
@@ -43,7 +43,7 @@ def check_vec_env(vec_env: VecEnv) -> None:
     elif isinstance(inner, GymnasiumVecEnv):
         _warn_of_casts(inner.envs.unwrapped)
     of_pettingzoo = steps_team_envs(vec_env)
-    _check_spaces(f"Wrappers of {shown(inner)} change", _spaces_of(vec_env), _spaces_of(inner), of_pettingzoo)
+    _check_spaces(f"{_wrappers_of(vec_env)} change", _spaces_of(vec_env), _spaces_of(inner), of_pettingzoo)
     if isinstance(inner, GymnasiumVecEnv):
         base = inner.envs.unwrapped
         own = (base.single_observation_space, base.single_action_space)
@@ -108,6 +108,15 @@ def _team_spaces(vec_env: VecEnv) -> list[tuple[spaces.Space, spaces.Space]]:
 
 def _spaces_of(env: Env | VecEnv) -> tuple[spaces.Space, spaces.Space]:
     return env.observation_space, env.action_space
+
+
+def _wrappers_of(vec_env: VecEnv) -> str:
+    """:return: the names of the wrappers around a vectorised environment"""
+    names, env = [], vec_env
+    while isinstance(env, VecEnvWrapper):
+        names.append(type(env).__name__)
+        env = env.venv
+    return f"The wrappers {', '.join(names)}"
 
 
 def _check_spaces(what: str, outer: Any, inner: Any, always: bool = False) -> None:

@@ -124,6 +124,7 @@ def test_pairs_of_a_repeated_option_come_together():
         ("[!!bool 1, a b]", "neither a list nor a dict"),
         ("[2001-99-99, a b]", "neither a list nor a dict"),
         ("[{position: [0, 0], radius:0.2}]", "'radius:0.2' needs a blank after the colon: radius: 0.2"),
+        ("{a: {b: 1, c: 2, b: 3}}", "'b' is given twice"),
         ("{a: {b:c}}", "'b:c' needs a blank after the colon: b: c"),
     ],
 )

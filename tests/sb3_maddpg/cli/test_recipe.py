@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from sb3_maddpg.cli.main import main
-from sb3_maddpg.cli.recipe import check_recipe, recipe_path
+from sb3_maddpg.cli.recipe import check_recipe, read_recipe, recipe_path
 
 RECIPE = {"n_timesteps": 100, "policy": "MlpPolicy", "learning_starts": 1000}
 
@@ -210,3 +210,18 @@ def test_a_wrapper_with_its_arguments_is_accepted():
 def test_a_recipe_that_is_neither_file_nor_module_is_refused(capsys):
     assert main(["train", "--env", "OwnBit-v0", "--conf-file", "../.."]) == 2
     assert "neither a YAML file nor a module" in capsys.readouterr().err
+
+
+def test_a_key_that_is_given_twice_is_named(tmp_path):
+    path = tmp_path / "recipe.yml"
+    path.write_text("base: &base {gamma: 0.9}\na: &a {b: &b {<<: *base, gamma: 0.8}}\nc: {<<: *b, gamma: 0.7}\n")
+    assert read_recipe(str(path), "maddpg", "c") == {"gamma": 0.7}, "merging is no repetition"
+    path.write_text("c:\n  gamma: 0.9\n  n_timesteps: 100\n  gamma: 0.8\n")
+    with pytest.raises(ValueError, match=r"recipe\.yml: 'gamma' is given twice"):
+        read_recipe(str(path), "maddpg", "c")
+
+
+def test_ppo_trains_own_environments_with_a_default():
+    assert read_recipe(recipe_path(None, "ppo", "my_env_v0"), "ppo", "my_env_v0")["policy"] == "MlpPolicy"
+    with pytest.raises(ValueError, match=r"no packaged recipe of a2c for my_env_v0: .* `my_env_v0: \{n_timesteps"):
+        recipe_path(None, "a2c", "my_env_v0")

@@ -154,7 +154,8 @@ def test_what_cannot_be_resumed_is_said(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for argv, message in (
         (["--resume"], "no run in logs has checkpoints"),
-        (["--resume", "nowhere"], "nowhere is not the folder of a run with checkpoints"),
+        (["--resume", "nowhere"], "--resume 'nowhere': there is no such folder"),
+        (["--resume", "."], ". is not the folder of a run with checkpoints (it has 0 args.yml)"),
         (["--env", "OwnBit-v0", "-f", ""], "--log-folder is empty"),
         (["--env", "OwnBit-v0", "--checkpoint-every", "-5"], "--checkpoint-every -5: pass a number of steps, or 0"),
     ):
@@ -163,7 +164,12 @@ def test_what_cannot_be_resumed_is_said(tmp_path, monkeypatch, capsys):
     Path("run/OwnBit-v0").mkdir(parents=True)
     Path("run/OwnBit-v0/args.yml").write_text("env: OwnBit-v0\n")
     assert main(["train", "--resume", "run"]) == 1
-    assert "run has no complete checkpoint" in capsys.readouterr().err
+    assert "run has no complete checkpoint: begin again, without --resume" in capsys.readouterr().err
+    Path("run/OwnBit-v0.zip").touch()
+    assert main(["train", "--resume", "run"]) == 1
+    assert "run is finished and has no checkpoints: train its model further with `train -i run/OwnBit-v0.zip" in (
+        capsys.readouterr().err
+    )
 
 
 def test_checkpoints_can_be_switched_off(tmp_path, monkeypatch):

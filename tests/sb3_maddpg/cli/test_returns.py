@@ -134,7 +134,8 @@ def test_trainings_in_environments_that_differ_are_named(here, capsys, tmp_path)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--policy", "nothing.zip"), "there is no file nothing.zip"),
+        (("--policy", "randon"), "Did you mean 'random'?"),
+        (("--policy", "nothing.zip"), "There is no file 'nothing.zip'"),
         (("--policy", "random", "random"), "--policy names random twice"),
         (("--policy", "random", "--plot", "r.yml"), "--plot r.yml is a file: name a folder"),
         (

@@ -99,9 +99,9 @@ def test_tables_come_at_a_readable_rate_and_short_trainings_log_their_rewards(ca
 
 
 def test_a_training_that_ends_before_it_learns_says_so(capsys):
-    assert train("-n", "50", "--verbose", "0") == 0
+    assert train("-n", "50") == 0
     assert "Nothing was learned: learning_starts=50, and there were 50 steps" in capsys.readouterr().out
-    assert train("-n", "60", "--verbose", "0") == 0
+    assert train("-n", "60") == 0
     assert "Nothing was learned" not in capsys.readouterr().out
 
 

@@ -97,6 +97,11 @@ def test_models_of_other_algorithms_are_refused(tmp_path, stream):
         with pytest.raises(ValueError, match=message):
             algorithm.load(io.BytesIO(path.read_bytes()) if stream else path)
     assert MATD3.load(tmp_path / "matd3").algorithm == "MATD3"
+    th.save({"weights": 1}, tmp_path / "other.pt")
+    with pytest.raises(ValueError, match=r"other\.pt holds no model of MADDPG"):
+        MADDPG.load(tmp_path / "other.pt")
+    with pytest.raises(ValueError, match="is a folder: name a model file in it"):
+        MADDPG.load(tmp_path)
 
 
 @pytest.mark.parametrize("changes", [{"file_format": 1}, {"file_format": 99}, {"file_format": None, "algorithm": None}])

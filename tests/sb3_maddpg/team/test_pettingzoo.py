@@ -247,6 +247,14 @@ def test_an_environment_may_go_on_listing_agents_that_ended():
     assert steps[-1][4]["metrics"]["rollout/ep_rew_a"] == 200
 
 
+def test_rewards_of_agents_that_do_not_exist_are_noticed():
+    def paid(env, observations, rewards, terminations, truncations, infos):
+        rewards["boss"] = 3.0
+
+    with pytest.warns(UserWarning, match="reward for 'boss' in step 1 .* not in possible_agents: it is ignored"):
+        play(TeamEnv(Broken(paid)))
+
+
 @pytest.mark.parametrize("reward", [5.0, np.float32(5.0), 0.0, None])
 def test_rewards_of_agents_that_ended_are_ignored_with_one_warning(reward):
     env = TeamEnv(Broken(lambda env, _, rewards, *__: rewards.setdefault("a", reward)))

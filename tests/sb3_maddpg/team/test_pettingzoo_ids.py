@@ -60,6 +60,31 @@ def test_a_file_in_the_present_folder_is_an_environment_id(tmp_path, monkeypatch
     assert gymnasium.make("flat_team").observation_space.names == ("agent_0", "agent_1", "agent_2")
 
 
+@pytest.mark.usefixtures("registry")
+def test_a_turn_based_module_is_an_environment_id():
+    assert find_environment("pettingzoo.classic.tictactoe_v3") == "pettingzoo.classic.tictactoe_v3"
+    assert gymnasium.make("pettingzoo.classic.tictactoe_v3").observation_space.names == ("player_1", "player_2")
+    with pytest.raises(ValueError, match=r"is no id for Gymnasium: write pettingzoo\.classic\.tictactoe_v3"):
+        pettingzoo_ids.register("pettingzoo.classic/tictactoe_v3")
+    with pytest.raises(InvalidArgumentError, match=r"Did you mean 'pettingzoo\.classic\.tictactoe_v3'\?"):
+        find_environment("tictactoe_v3")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("mpe2/simple_spread", "did you mean 'mpe2/simple_spread_v3'"),  # which is a package without an environment
+        ("sisl/pursuit_v4", r"in this folder\?$"),  # not the standard library's ssl
+        ("mpe2/no_module_v0", r"did you mean|nearest ids"),
+        ("MPE2/simple_spread_v9", r"Did you mean 'mpe2'\?$"),
+    ],
+)
+def test_an_id_that_is_unknown_is_not_what_is_suggested(env_id, message):
+    with pytest.raises(InvalidArgumentError, match=message) as refused:
+        find_environment(env_id)
+    assert f"mean '{env_id}'" not in str(refused.value)
+
+
 def test_packages_with_a_module_are_found():
     assert pettingzoo_ids.packaged("simple_spread_v3") == ["mpe2/simple_spread_v3"]
     assert pettingzoo_ids.packaged("no_module_v0") == []

@@ -497,7 +497,7 @@ class PlainSpaces(VecEnvWrapper):
 
 
 def test_vectorised_wrappers_keep_the_spaces_of_a_team():
-    with pytest.raises(ValueError, match="change the observations of the team"):
+    with pytest.raises(ValueError, match="The wrappers PlainSpaces change the observations of the team"):
         MADDPG("MlpPolicy", PlainSpaces(DummyVecEnv([toy])), **SMALL)
     with pytest.raises(ValueError, match="change the actions of the team"):
         MADDPG("MlpPolicy", PlainSpaces(DummyVecEnv([lambda: TeamEnv(Toy("continuous"))]), -0.5), **SMALL)
