@@ -78,11 +78,23 @@ def make_robot(index, n_robots, folder, rule):
 
 
 def check_team(addresses, config):
-    """Refuse starts and goals that are not one for each robot, in the workspace, and apart."""
-    if not len(addresses) == len(STARTS) == len(GOALS) == config.n_robots:
-        counts = f"{len(addresses)} addresses, {len(STARTS)} STARTS and {len(GOALS)} GOALS"
-        raise ValueError(f"{counts} for {config.n_robots} robots; edit STARTS and GOALS in {__file__}")
+    """Refuse addresses, starts and goals that are not one for each robot, in the workspace, and apart."""
+    n = config.n_robots
+    if len(set(addresses)) != len(addresses) or len(addresses) != n:
+        raise ValueError(f"--addresses: {len(set(addresses))} different ones for {n} robots; each needs its own")
+    if not len(STARTS) == len(GOALS) == n:
+        raise ValueError(f"{len(STARTS)} STARTS and {len(GOALS)} GOALS for {n} robots; edit them in {__file__}")
     config.check_flight(STARTS, GOALS, config.obstacles.listed)
+
+
+def open_link(index, addresses):
+    """Return the link of a robot to the others, whose session all share."""
+    (host, port), others = addresses[index], {k: a for k, a in enumerate(addresses) if k != index}
+    try:
+        return UdpLink(index, others, host, port, session=7)
+    except OSError as error:
+        why = f"cannot receive at {host}:{port} ({error.strerror}): --index or --addresses is wrong"
+        raise SystemExit(f"robot {index}: {why}") from None
 
 
 def fly(index, addresses, begins, duration, folder, rule, shared):
@@ -95,8 +107,9 @@ def fly(index, addresses, begins, duration, folder, rule, shared):
     except ValueError as error:
         raise SystemExit(f"robot {index}: {error}") from None
     config = robot.config
-    (host, port), others = addresses[index], {k: a for k, a in enumerate(addresses) if k != index}
-    link = UdpLink(index, others, host, port, session=7)  # a session that all share
+    if not 0 < (ahead := begins / 1e6 - time.time()) < 600:
+        raise SystemExit(f"robot {index}: it would begin in {ahead:.1f} s; give microseconds, in at most ten minutes")
+    link = open_link(index, addresses)
     vehicle = MyVehicle(index, config, shared)
     # For your room: fence, braking and radius must fit between workspace and wall. Below the separation, here halfway
     # between contact and what planners keep, robots hold their places. At the height `ground`, your vehicle stands.
@@ -106,9 +119,8 @@ def fly(index, addresses, begins, duration, folder, rule, shared):
     loop.warm_up()  # the first time on a machine, it compiles the planner
     freeze_garbage()
     begins = link.own(begins)
-    if not 0 < begins - monotonic() < 600_000_000:
-        ahead = (begins - monotonic()) / 1e6
-        raise SystemExit(f"robot {index}: it would begin in {ahead:.1f} s; give microseconds, in at most ten minutes")
+    if begins < monotonic():
+        raise SystemExit(f"robot {index}: it was not ready when all begin; give it more time")
     try:
         state = loop.ready().state
     except ValueError as error:
@@ -179,8 +191,8 @@ def fly_all(duration, folder, rule):
 def address(text):
     """Parse HOST:PORT."""
     host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT, with a port up to 65535")
     return host, int(port)
 
 
@@ -197,7 +209,11 @@ if __name__ == "__main__":
     parser.add_argument("--shared", metavar="FILE", help="states of the simulated vehicles")
     parser.add_argument("--quick", action="store_true", help="fly for a second only")
     args = parser.parse_args()
+    if not 0 < args.duration < np.inf:
+        parser.error(f"--duration {args.duration:g}: it must be a number above 0")
     if args.index is None:
+        if args.addresses or args.begins or args.shared:
+            parser.error("--addresses, --begins and --shared need --index: which robot is this one?")
         rule = args.rule if args.files else args.rule or "cpa:1.1s:2"  # asks those whom it would come close to
         sys.exit(fly_all(1.0 if args.quick else args.duration, args.files, rule))
     if args.addresses is None or args.begins is None or not (args.files or args.rule):

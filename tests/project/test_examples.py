@@ -7,6 +7,7 @@ import runpy
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,7 @@ def test_a_robot_lands_at_ctrl_c(tmp_path):
     [
         ([[9.0, 9, 9], [-2, 0, 1.5]], "goals[0]=[9.0, 9.0, 9.0] is 8.88 m outside the workspace"),
         ([[2.0, 0, 1.5], [2, 0.1, 1.5]], "cannot be at both goals"),
-        ([[2.0, 0, 1.5]], "2 addresses, 2 STARTS and 1 GOALS for 2 robots; edit STARTS and GOALS in"),
+        ([[2.0, 0, 1.5]], "2 STARTS and 1 GOALS for 2 robots; edit them in"),
     ],
 )
 def test_a_robot_refuses_goals_that_no_team_can_fly_to(goals, message):
@@ -65,6 +66,25 @@ def test_a_robot_refuses_goals_that_no_team_can_fly_to(goals, message):
     names["check_team"].__globals__["GOALS"] = np.array(goals)
     with pytest.raises(ValueError, match=re.escape(message)):
         names["check_team"]([("10.0.0.1", 1), ("10.0.0.2", 1)], make_config("flight-v2", n_robots=2))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--index", "0", "--addresses", "127.0.0.1:5", "127.0.0.1:5"], "1 different ones for 2 robots"),
+        (["--index", "0", "--addresses", "203.0.113.9:5", "127.0.0.1:6"], "cannot receive at 203.0.113.9:5"),
+        (["--index", "0", "--addresses", "127.0.0.1:99999"], "with a port up to 65535"),
+        (["--addresses", "127.0.0.1:5", "127.0.0.1:6"], "which robot is this one?"),
+        (["--duration", "-5"], "--duration -5: it must be a number above 0"),
+    ],
+)
+def test_a_robot_says_what_its_command_line_lacks(words, message):
+    begins = str(time.time_ns() // 1000 + 500_000_000)
+    words = [*words, "--rule", "none", *(["--begins", begins] if "--index" in words else [])]
+    command = [sys.executable, str(EXAMPLES / "robot_loop.py"), *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode != 0
+    assert message in done.stderr.splitlines()[-1]
 
 
 @pytest.mark.slow

@@ -40,6 +40,7 @@ from quad_swarm.realtime.virtual import VirtualFlight
 from quad_swarm.robot import files
 from quad_swarm.ros.world import RosWorld
 from quad_swarm.validation import read_assignments
+from quad_swarm.world.disturbances import Radio
 from quad_swarm.world.kinds import make_planners
 from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_config
 from quad_swarm.world.route import Targets
@@ -49,6 +50,7 @@ EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swa
 LINKS = ("udp", "ros2", "virtual")
 _LINGER = 1.0  # s
 _MUCH = 0.02  # share of late commands
+_FLOWN = ("range", "half_distance", "path_loss_exponent")  # fields of the radio
 _ATTEMPTS = 3  # to fly an episode without the machine standing still
 
 
@@ -294,8 +296,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _main(args: argparse.Namespace) -> None:
-    if args.episodes < 1:
-        raise ValueError(f"--episodes {args.episodes}: fly at least one.")
+    _check(args)
     if args.json is not None:
         check_writable(args.json, "--json")
     exported = {one for one in args.policy if (Path(one) / files.DESCRIPTION).is_file()}
@@ -304,6 +305,7 @@ def _main(args: argparse.Namespace) -> None:
     worlds = {one: files.load(one).config for one in sorted(exported)}
     preset, base = _base(args.preset, models, worlds)
     config = make_config(base, read_assignments("--world", args.world), n_robots=args.n_robots, plant=args.plant)
+    _check_radio(config, make_config(base))
     config = for_scenario(config, args.scenario)
     if not 0 <= args.priority <= 99:
         raise ValueError(f"--priority {args.priority}: it must be from 1 to 99, or 0 for none.")
@@ -342,8 +344,32 @@ def _main(args: argparse.Namespace) -> None:
                 rows[-1]["cpu"] = None
     print(format_table(rows))
     print(LEGEND)
+    world = " ".join([f"preset: {preset}", *args.world])
+    print(f"{world}; messages lost on purpose: {args.loss:.0%} (--loss)")
     if args.json is not None:
         write_rows(args.json, rows)
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.episodes < 1:
+        raise ValueError(f"--episodes {args.episodes}: fly at least one.")
+    if not 0 < args.most < np.inf:
+        raise ValueError(f"--most {args.most:g}: it must be a number of seconds above 0.")
+
+
+def _check_radio(config: SwarmConfig, base: SwarmConfig) -> None:
+    """Refuse what only simulated radios do.
+
+    :param config: the world
+    :param base: what it was before the user changed it
+    """
+    for one in dataclasses.fields(Radio):
+        value = getattr(config.radio, one.name)
+        if one.name not in _FLOWN and value != getattr(base.radio, one.name):
+            raise ValueError(
+                f"radio.{one.name}={value}: here messages are sent, and no radio is simulated but for its range. Lose "
+                "some with --loss; `sb3-maddpg evaluate` flies all of `radio`."
+            )
 
 
 def _try(team: Team, scene: Scene) -> None:

@@ -133,8 +133,9 @@ class Radio:
     def __post_init__(self) -> None:
         if self.round_trip is not None and self.delay:
             raise ValueError(
-                f"round_trip={self.round_trip} and delay={self.delay}: an answer comes later or is older; set delay=0, "
-                "or leave out round_trip"
+                f"radio.round_trip={self.round_trip} and radio.delay={self.delay} both say when answers count: give "
+                "radio.round_trip alone (steps from a request to its answer), or set radio.round_trip=null (answers "
+                "hold plans that are radio.delay steps old)"
             )
 
     @functools.cached_property

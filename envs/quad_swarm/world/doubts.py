@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from quad_swarm.geometry import length
 from quad_swarm.planner import PlannerConfig
 from quad_swarm.quadrotor import QuadrotorParams
 
@@ -222,6 +223,7 @@ def _up(number: float) -> float:
 def doubts(config: SwarmConfig) -> Iterator[str]:
     """Yield a sentence about everything that is doubtful about a world, with a field and what to do. How vehicles with
     dynamics from outside move is not known here."""
+    yield from _doubts_about_obstacles(config)
     if not config.flies_quadrotors:
         yield from _doubts_about_the_others(config)
         return
@@ -382,6 +384,21 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
             f"memory={config.memory:g}: plans count as right that are off by more than the distance at which robots "
             f"touch, {2 * config.radius:g} m; use a few centimetres, as in the presets"
         )
+
+
+def _doubts_about_obstacles(config: SwarmConfig) -> Iterator[str]:
+    low, high = np.array(config.planner.workspace_low), np.array(config.planner.workspace_high)
+    reach = config.radii.max() + config.obstacle_margin
+    for number, one in enumerate(config.obstacles.listed):
+        times = np.linspace(0.0, min(config.max_steps, 100_000) * config.planner.dt if one.moves else 0.0, 1000)
+        centres = np.array([one.after(time).position for time in times])
+        shape = (1.0, 1.0, 0.0) if one.shape == "cylinder" else 1.0
+        outside = length(np.maximum(np.maximum(low - centres, centres - high), 0.0) * shape).min() - one.radius
+        if outside > reach:
+            yield (
+                f"obstacles.listed.{number} with position={list(one.position)} stays {outside:.3g} m or more outside "
+                "the workspace, where it keeps no robot from anything; lengths are in metres"
+            )
 
 
 def _doubts_about_speed(config: SwarmConfig) -> Iterator[str]:

@@ -90,6 +90,17 @@ def test_a_cruise_distance_that_is_too_far_is_no_remedy():
     assert far_goals(config)[0] == far_goals(make_config("paper"))[0]
 
 
+FAR, NEAR = ({"position": (x, 0, 30), "radius": 0.3} for x in (30, 5))
+HIGH = {"position": (0, 0, 9), "radius": 0.3, "shape": "sphere"}
+PAST = {"position": (30, 30, 1), "radius": 0.3, "velocity": (-3, 0, 0)}
+
+
+def test_obstacles_that_come_are_not_doubtful():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DoubtfulWorld)
+        make_config("paper", {"obstacles": {"listed": [NEAR, {**PAST, "velocity": (-3, -3, 0)}]}})
+
+
 @pytest.mark.parametrize(
     ("preset", "world", "message"),
     [
@@ -124,6 +135,9 @@ def test_a_cruise_distance_that_is_too_far_is_no_remedy():
         ("paper", {"planner": {"goal_weight": 0}}, r"goal_weight=0: robots do not fly to their goals"),
         ("paper", {"space": {"half_width": 60}, "max_steps": 999}, r"more than 41 m away.*cruise_distance=6,"),
         ("paper", {"neighbourhood": {"range": 1}}, r"neighbourhood\.range=1: .* use at least 2\.4"),
+        ("paper", {"obstacles": {"listed": [FAR]}}, r"obstacles\.listed\.0 .* stays 24\.9 m or more outside"),
+        ("paper", {"obstacles": {"listed": [NEAR, HIGH]}}, r"obstacles\.listed\.1 .* 6\.3 m .* lengths are in met"),
+        ("paper", {"obstacles": {"listed": [PAST]}}, r"obstacles\.listed\.0 .* stays \d"),
         ("paper", {"planner": {"separation": 3}, "space": {"spacing": 1}}, r"space\.spacing=1: .* use at least 2\.6"),
     ],
 )  # fmt: skip
