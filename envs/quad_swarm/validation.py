@@ -390,6 +390,7 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
 
 def _readable(message: str) -> str:
     message = message.removeprefix("Value error, ").replace("Input should", "it must", 1)
+    message = message.replace("a valid tuple", "a list, [...]")
     return message.replace("dictionary", "mapping").replace(" or an instance of", ", not a plain value, or a")
 
 

@@ -46,7 +46,7 @@ from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_co
 from quad_swarm.world.route import Targets
 from quad_swarm.world.scenarios import CHANGING_GOALS, SCENARIOS, ScenarioSampler, Scene
 
-EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swarm-flight --episodes 3 --loss 0.1"
+EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swarm-flight-v2 --episodes 3 --loss 0.1"
 LINKS = ("udp", "ros2", "virtual")
 _LINGER = 1.0  # s
 _MUCH = 0.02  # share of late commands

@@ -93,9 +93,9 @@ def test_command_lines_and_files_give_vehicles():
 @pytest.mark.parametrize(
     ("vehicles", "message"),
     [
-        (3, "vehicles=3: it must be a valid tuple"),
+        (3, r"vehicles=3: it must be a list, \["),
         ([3], "vehicles.0=3: it must be a mapping"),
-        ({"radius": 0.2}, "it must be a valid tuple"),
+        ({"radius": 0.2}, r"it must be a list, \["),
         ([{}, {"radus": 0.2}], "Unknown vehicles.1 parameter 'radus'.* mean 'radius'"),
         ([{"radius": 0}], "vehicles.0.radius=0: it must be greater than 0"),
         ([{"radius": float("nan")}], "vehicles.0.radius=nan: it must be a finite number"),
