@@ -388,7 +388,7 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
 
 def _doubts_about_obstacles(config: SwarmConfig) -> Iterator[str]:
     low, high = np.array(config.planner.workspace_low), np.array(config.planner.workspace_high)
-    reach = config.radii.max() + config.obstacle_margin
+    reach = max([config.radius, *(one.radius or 0.0 for one in config.vehicles)]) + config.obstacle_margin
     for number, one in enumerate(config.obstacles.listed):
         times = np.linspace(0.0, min(config.max_steps, 100_000) * config.planner.dt if one.moves else 0.0, 1000)
         centres = np.array([one.after(time).position for time in times])
