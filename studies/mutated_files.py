@@ -237,9 +237,9 @@ def files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
     model.save(folder / "lean.zip", lean="actor")
     model.save_replay_buffer(folder / "buffer.pkl")
     env.save(str(folder / "stats.pkl"))
-    (folder / "config.yml").write_text(
-        yaml.dump({"policy": "MlpPolicy", "n_timesteps": 5, "env_kwargs": {"a": [1, 2]}}) * 3
-    )
+    recipe = {"policy": "MlpPolicy", "n_timesteps": 5, "env_kwargs": {"a": [1, 2]}}
+    again = {f"{key}_{k}": value for k in range(2) for key, value in recipe.items()}
+    (folder / "config.yml").write_text(yaml.dump(recipe | again))
     found = checkpoints.newest(folder / "run")
     assert found is not None
 
