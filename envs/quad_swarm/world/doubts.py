@@ -390,8 +390,9 @@ def _doubts_about_obstacles(config: SwarmConfig) -> Iterator[str]:
     low, high = np.array(config.planner.workspace_low), np.array(config.planner.workspace_high)
     reach = max([config.radius, *(one.radius or 0.0 for one in config.vehicles)]) + config.obstacle_margin
     for number, one in enumerate(config.obstacles.listed):
-        times = np.linspace(0.0, min(config.max_steps, 100_000) * config.planner.dt if one.moves else 0.0, 1000)
-        centres = np.array([one.after(time).position for time in times])
+        last = min(config.max_steps, 100_000) * config.planner.dt
+        times = np.linspace(0.0, last, 1000) if one.moves else np.zeros(1)
+        centres = np.array(one.position) + times[:, None] * np.array(one.velocity)
         shape = (1.0, 1.0, 0.0) if one.shape == "cylinder" else 1.0
         outside = length(np.maximum(np.maximum(low - centres, centres - high), 0.0) * shape).min() - one.radius
         if outside > reach:
