@@ -5,18 +5,21 @@ nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios 
 ``rules``, ``teams`` (four and twelve) and ``none``; set 701 ``learned`` (version 1's model), ``hummingbird`` and
 ``crazyflie`` (the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and
 ``crowd`` (full communication of sixteen) in all scenarios; set 702 ``identified``, RotorPy's Hummingbird with its own
-model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five times as often;
-set 704 the same of four, twelve and, without obstacles, sixteen (``four_again``, ``twelve_again``, ``crowd_again``);
-set 705 ``one_small`` and ``one_large``, one model of version 1 at one threshold, with four to sixteen robots; set 706
+model in the planner; set 703 ``eight``, full communication of eight in all scenarios again, five times as often; set
+704 the same of four, twelve and, without obstacles, sixteen (``four_again``, ``twelve_again``, ``crowd_again``); set
+705 ``one_small`` and ``one_large``, one model of version 1 at one threshold, with four to sixteen robots; set 706
 ``safe_small`` and ``safe_large``, the same model at a lower threshold, and ``among_four``, ``among_eight``,
 ``among_twelve`` and ``among_sixteen``, full communication and that model among obstacles, after these had been given a
 larger penalty than robots; set 707 ``trained_four``, ``trained_eight``, ``trained_twelve`` and ``trained_sixteen``, the
 packaged model, which was trained in version 2 and with obstacles; set 708 ``seeds_four``, ``seeds_eight``,
 ``seeds_twelve`` and ``seeds_sixteen``, its recipe with other training seeds, at its threshold; set 709
 ``braking_learned``, ``braking_full``, ``braking_twelve`` and ``braking_sixteen``, full communication and the packaged
-model among obstacles with the braking reserve. All parts before set 706 fly with equal penalties, those before set 709
-without the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`;
-written after each row, so that a run that is ended keeps what it has.
+model among obstacles with the braking reserve; set 710 ``five_eight``, ``five_among_eight``, ``five_four``,
+``five_twelve`` and ``five_sixteen``, the flights that the other seeds need to have 12,000 of eight robots and 4,000 of
+other numbers with the packaged model, and ``rule_again``, the best rule as often as full communication. All parts
+before set 706 fly with equal penalties, those before set 709 without the reserve, as they did. JSON: one row per
+policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run that is ended
+keeps what it has.
 """
 
 from __future__ import annotations
@@ -40,7 +43,7 @@ from studies.swarm.experiment import condition
 from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
-SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING = range(700, 710)
+SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -53,7 +56,7 @@ ONE_MODEL = f"{models('flight')[4]}@0.5"
 SAFE_MODEL = f"{models('flight')[4]}@0.4"
 # The model that was trained in version 2, at the threshold that was chosen on sets 51 and 52
 OWN_MODEL = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.4"
-OTHER_SEEDS = tuple(f"{model}@0.4" for model in models("flight_v2"))
+OTHER_SEEDS = tuple(f"studies/swarm/data/flight_v2_seed{seed}.zip@0.4" for seed in (1, 2, 3, 4))
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
 CHECKED: dict[str, Any] = {"radio": {"jitter": 0}, "planner": {"commitment": 0.0}}
@@ -120,14 +123,20 @@ PARTS = {
     "trained_twelve": Part((OWN_MODEL,), EVERYWHERE, (12,), 2000, TRAINED),
     "trained_sixteen": Part((OWN_MODEL,), EVERYWHERE, (16,), 2000, TRAINED),
     "trained_four": Part((OWN_MODEL,), EVERYWHERE, (4,), 2000, TRAINED),
-    "seeds_four": Part(OTHER_SEEDS, EVERYWHERE, (4,), 2000, SEEDS),
-    "seeds_eight": Part(OTHER_SEEDS, EVERYWHERE, (8,), 2000, SEEDS),
-    "seeds_twelve": Part(OTHER_SEEDS, EVERYWHERE, (12,), 2000, SEEDS),
-    "seeds_sixteen": Part(OTHER_SEEDS, EVERYWHERE, (16,), 2000, SEEDS),
+    "seeds_four": Part(OTHER_SEEDS[:2], EVERYWHERE, (4,), 2000, SEEDS),
+    "seeds_eight": Part(OTHER_SEEDS[:2], EVERYWHERE, (8,), 2000, SEEDS),
+    "seeds_twelve": Part(OTHER_SEEDS[:2], EVERYWHERE, (12,), 2000, SEEDS),
+    "seeds_sixteen": Part(OTHER_SEEDS[:2], EVERYWHERE, (16,), 2000, SEEDS),
     "braking_sixteen": Part(("full", OWN_MODEL), tuple(MOST_OBSTACLES), (16,), 2000, BRAKING),
     "braking_twelve": Part(("full", OWN_MODEL), tuple(MOST_OBSTACLES), (12,), 2000, BRAKING),
     "braking_learned": Part((OWN_MODEL,), tuple(MOST_OBSTACLES), (8, 4), 2000, BRAKING),
     "braking_full": Part(("full",), tuple(MOST_OBSTACLES), (8, 4), 4000, BRAKING),
+    "rule_again": Part((BEST_RULE,), ("symmetric_swap",), (8,), 10000, FIVE),
+    "five_eight": Part(OTHER_SEEDS[2:], tuple(without_obstacles()), (8,), 3000, FIVE),
+    "five_among_eight": Part(OTHER_SEEDS, tuple(MOST_OBSTACLES), (8,), 2500, FIVE),
+    "five_four": Part(OTHER_SEEDS, EVERYWHERE, (4,), 500, FIVE),
+    "five_twelve": Part(OTHER_SEEDS, EVERYWHERE, (12,), 500, FIVE),
+    "five_sixteen": Part(OTHER_SEEDS, EVERYWHERE, (16,), 500, FIVE),
 }
 
 

@@ -37,8 +37,11 @@ def test_sets_of_episodes_are_apart():
         version2.ONE,
         version2.AMONG,
         version2.TRAINED,
+        version2.SEEDS,
+        version2.BRAKING,
+        version2.FIVE,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 15
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 18
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
