@@ -117,7 +117,7 @@ def draw_flight_fronts(tried: Rows, twelve: Rows, sixteen: Rows, path: Path) -> 
     figure = Figure(figsize=(8, 4), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, n in zip(panels, (8, 16), strict=True):
-        tries, *flown = ([r for r in rows if _hardest(r, n)] for rows in (tried, twelve, sixteen))
+        tries, *flown = ([r for r in rows if hardest(r, n)] for rows in (tried, twelve, sixteen))
         # Most were dropped after few episodes, which say little unless some ended in collisions
         told = [r for r in tries if r["episodes"] >= 500 or r["collisions"] >= 3]
         rules = [r for r in told if not is_model(r["setting"]) and r["setting"] != "full"]
@@ -155,7 +155,8 @@ def draw_flight_fronts(tried: Rows, twelve: Rows, sixteen: Rows, path: Path) -> 
     figure.savefig(path)
 
 
-def _hardest(row: dict[str, Any], n_robots: int) -> bool:
+def hardest(row: dict[str, Any], n_robots: int) -> bool:
+    """Return whether a row is of the symmetric swap with so many robots."""
     return (row["scenario"], row["n_robots"]) == ("symmetric_swap", n_robots)
 
 

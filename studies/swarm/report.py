@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 
 from quad_swarm.evaluation.flight import Flight
-from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
+from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison, wilson_interval
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
+from quad_swarm.plants.base import MODEL
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import PRESETS
+from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import absolute_path
 from studies.swarm.figures import (
     NAMES,
@@ -29,6 +31,7 @@ from studies.swarm.figures import (
     draw_fronts,
     draw_trajectories,
     flights,
+    hardest,
     rate_of,
 )
 from studies.swarm.fly import PAPERS
@@ -45,6 +48,7 @@ PAGES = (
     ),
 )
 IMAGES = ROOT / "docs" / "images"
+VERSION_2 = ROOT / "studies" / "data"
 Rows = list[dict[str, Any]]
 # With which the best one was found; `families` has no longer the 56 of them that only a simulation can fly
 RULES_TRIED = 538
@@ -503,32 +507,49 @@ def headline_table(rows: Rows, best: str) -> str:
     return table([*head, "plans sent, of all possible, all scenarios", "bytes/s a robot sends, all scenarios"], lines)
 
 
-def glance_table(rows: Rows, best: str) -> str:
-    """Format the symmetric swap of eight robots in the sealed flights of `flight`: what it is worth, and what it costs.
+def glance_table(rows: Rows, orca: Rows) -> str:
+    """Format the symmetric swap of eight robots in the sealed flights of `flight-v2`: what it is worth, what it costs.
 
-    :param rows: rows of the sealed flights
-    :param best: the tuned rule
+    :param rows: rows of `studies.swarm.version2`; those of several sets are counted together
+    :param orca: rows of ORCA in several presets
     """
-    here = [row for row in rows if (row["n_robots"], row["scenario"]) == (8, "symmetric_swap")]
-    full = next((row["steps_to_arrival"] for row in here if row["policy"] == FULL), None)
+    here = [row for row in rows if hardest(row, 8) and row["plant"] == MODEL]
+    learned = [row for row in here if "flight-v2" in row["policy"] or "flight_v2_seed" in row["policy"]]
     groups = {
         "nobody tells anybody": [row for row in here if row["policy"] == "none"],
         "everybody tells everybody": [row for row in here if row["policy"] == FULL],
-        f"cheapest of {RULES_TRIED} rules that is safe with up to twelve": [r for r in here if r["policy"] == best],
-        "**learned**": [row for row in here if "/flight_seed" in row["policy"]],
+        "[ORCA](docs/planner.md#without-messages-orca-and-voronoi-cells)": [
+            row for row in orca if hardest(row, 8) and row["preset"] == "flight-v2"
+        ],
+        f"best of {RULES_TRIED} rules": [row for row in here if row["policy"] == BEST_RULE],
+        f"**learned**, {len({row['policy'] for row in learned})} training seeds together": learned,
     }
+    full = _weighted(groups["everybody tells everybody"], "steps_to_arrival", "arrived")
     lines = []
     for what, chosen in groups.items():
-        seeds = f", {len(chosen)} training seeds" if len(chosen) > 1 else ""
-        sent = sorted(row["request_share"] for row in chosen)
-        times = sorted(row["steps_to_arrival"] for row in chosen if row["steps_to_arrival"] is not None)
-        later = "-"
-        if times and full and chosen[0]["policy"] == FULL:
-            later = f"{full * PRESETS['flight'].planner.dt:.1f} s"
-        elif times and full and chosen[0]["policy"] != "none":  # only those arrive there that met nobody
-            later = spread([f"+{time / full - 1:.0%}" for time in times])
-        lines.append([what + seeds, seeds_rate(chosen), spread([f"{share:.1%}" for share in sent]), later])
+        by_seed = [[row for row in chosen if row["policy"] == one] for one in sorted({row["policy"] for row in chosen})]
+        sent = sorted(_weighted(one, "request_share", "episodes") for one in by_seed)
+        times = sorted(_weighted(one, "steps_to_arrival", "arrived") / full - 1 for one in by_seed)
+        later = spread([f"+{time:.0%}" for time in times])
+        if what == "nobody tells anybody":  # only those arrive there that met nobody
+            later = "-"
+        elif what == "everybody tells everybody":
+            later = f"{full * PRESETS['flight-v2'].planner.dt:.1f} s"
+        lines.append([what, together(chosen), spread([f"{share:.1%}" for share in sent]), later])
     return table(["", "flights with a collision", "plans sent", "arrival, beside full"], lines)
+
+
+def _weighted(rows: Rows, name: str, by: str) -> float:
+    return float(np.average([row[name] for row in rows], weights=[row[by] for row in rows]))
+
+
+def together(rows: Rows) -> str:
+    """Format the collisions in all rows, with the interval of their rate."""
+    collisions, episodes = (sum(row[name] for row in rows) for name in ("collisions", "episodes"))
+    low, high = (100 * end for end in wilson_interval(collisions, episodes))
+    # Narrow columns would break lines anywhere
+    lines = (f"{collisions:,} of {episodes:,}", f"[{low:.2f}, {high:.2f}] %")
+    return "<br>".join(line.replace(" ", "&nbsp;") for line in lines)
 
 
 def seeds_rate(rows: Rows) -> str:
@@ -655,7 +676,7 @@ def main() -> None:
         "counterfactual": reference_table(rows["counterfactual"], "price"),
         "training": training_table(rows["training"]),
         "headline": headline_table(rows["flight"], best_rule()) if rows["flight"] else "Not flown yet.",
-        "glance": glance_table(rows["flight"], best_rule()) if rows["flight"] else "Not flown yet.",
+        "glance": glance_table(*(read_rows(VERSION_2 / f"{name}.json") for name in ("version2", "orca"))),
         "flight": flight_table(rows["flight"]),
         "flight tuning": tuned_table(rows["flight_tuning"]),
         "flight targets": flight_targets(rows["flight"]),

@@ -45,25 +45,27 @@ def test_sets_of_episodes_are_apart():
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
-    def row(policy: str, collisions: int, share: float, steps: float, name: str = "symmetric_swap") -> dict:
-        figures = {"n_robots": 8, "scenario": name, "policy": policy, "request_share": share, "episodes": 12000}
-        figures |= {"collisions": collisions, "steps_to_arrival": steps}
-        return figures | {"collision_low": collisions / 24000, "collision_high": collisions / 6000}
+    def row(policy: str, collisions: int, share: float, steps: float, **changed) -> dict:
+        figures = {"n_robots": 8, "scenario": "symmetric_swap", "policy": policy, "plant": "model", "episodes": 2000}
+        figures |= {"collisions": collisions, "request_share": share, "steps_to_arrival": steps, "arrived": 1000}
+        return figures | changed
 
-    rows = [row("full", 0, 1.0, 70.0), row("none", 9000, 0.0, 80.0), row("cpa:1:2", 2, 0.07, 77.0)]
-    rows += [row("d/flight_seed0.zip", 3, 0.02, 73.5), row("d/flight_seed1.zip", 1, 0.01, 77.0)]
-    rows += [row("d/flight_seed1.zip", 99, 0.5, 1.0, name="random")]
-    text = report.glance_table(rows, "cpa:1:2").replace("&nbsp;", " ").replace("<br>", " ")
-    none, full, rule, learned = [line.strip("| ").split(" | ") for line in text.splitlines()[2:]]
-    assert none[1:] == ["9,000 of 12,000 [37.50, 150.00] %", "0.0%", "-"]
-    assert full[2:] == ["100.0%", "3.5 s"]
-    assert rule[2:] == ["7.0%", "+10%"]
-    assert learned == [
-        "**learned**, 2 training seeds",
-        "1 to 3 of 12,000 [0.00, 0.05] %",
-        "1.0% to 2.0%",
-        "+5% to +10%",
+    learned = "pretrained:quad-swarm-flight-v2@0.4", "d/flight_v2_seed1.zip@0.4"
+    rows = [row("full", 0, 1.0, 70.0), row("full", 1, 1.0, 70.0, episodes=10000), row("none", 1800, 0.0, 80.0)]
+    rows += [row(commitment.BEST_RULE, 2, 0.07, 77.0), row(learned[0], 3, 0.02, 73.5), row(learned[1], 0, 0.01, 77.0)]
+    rows += [row(learned[1], 1, 0.02, 77.0), row(learned[1], 99, 0.5, 1.0, scenario="random")]
+    rows += [row("full", 99, 1.0, 1.0, plant="rotorpy:hummingbird"), row("full", 99, 1.0, 1.0, n_robots=16)]
+    orca = [row("none", 0, 0.0, 80.5, preset="flight-v2"), row("none", 99, 0.0, 1.0, preset="flight-hard")]
+    text = report.glance_table(rows, orca).replace("&nbsp;", " ").replace("<br>", " ")
+    cells = [line.strip("| ").split(" | ") for line in text.splitlines()[2:]]
+    assert [line[1:] for line in cells] == [
+        ["1,800 of 2,000 [88.61, 91.24] %", "0.0%", "-"],
+        ["1 of 12,000 [0.00, 0.05] %", "100.0%", "3.5 s"],
+        ["0 of 2,000 [0.00, 0.19] %", "0.0%", "+15%"],
+        ["2 of 2,000 [0.03, 0.36] %", "7.0%", "+10%"],
+        ["4 of 6,000 [0.03, 0.17] %", "1.5% to 2.0%", "+5% to +10%"],
     ]
+    assert cells[-1][0] == "**learned**, 2 training seeds together"
 
 
 @pytest.mark.parametrize("family", tune_flight.families(16))

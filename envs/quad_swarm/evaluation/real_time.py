@@ -42,7 +42,7 @@ from quad_swarm.ros.world import RosWorld
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.disturbances import Radio
 from quad_swarm.world.kinds import make_planners
-from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_config
+from quad_swarm.world.presets import PRESETS, REAL_TIME, SwarmConfig, for_scenario, make_config
 from quad_swarm.world.route import Targets
 from quad_swarm.world.scenarios import CHANGING_GOALS, SCENARIOS, ScenarioSampler, Scene
 
@@ -256,7 +256,7 @@ def make_parser() -> Parser:
     parser.add_argument("--n-robots", type=int, help="number of robots (default: the preset's)")
     parser.add_argument(
         "--preset",
-        help=f"{', '.join(PRESETS)} (default: the world of exported folders, or that of the models, otherwise flight)",
+        help=f"{', '.join(PRESETS)} (default: that of exported folders or models, otherwise {REAL_TIME})",
     )
     parser.add_argument(
         "--world", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="fields of the preset"
@@ -394,7 +394,7 @@ def _base(
     :raises ValueError: if models or folders have different ones
     """
     if preset is not None or not worlds:
-        preset = preset or (preset_of(models) if models else "flight")
+        preset = preset or (preset_of(models) if models else REAL_TIME)
         return preset, preset
     first, *others = worlds
     for other in others:

@@ -44,11 +44,11 @@ from quad_swarm.ros.node import (
 )
 from quad_swarm.ros.world import VehicleTopics
 from quad_swarm.validation import read_assignments
-from quad_swarm.world.presets import for_scenario, make_config, points
+from quad_swarm.world.presets import REAL_TIME, for_scenario, make_config, points
 from quad_swarm.world.scenarios import ScenarioSampler
 
 PARAMETERS: dict[str, Any] = {
-    "preset": "flight",
+    "preset": REAL_TIME,
     "world": [],
     "plant": "",
     "names": [],

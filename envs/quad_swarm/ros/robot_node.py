@@ -70,12 +70,12 @@ from quad_swarm.ros.vehicles import (
     TeamVehicle,
 )
 from quad_swarm.validation import read_assignments
-from quad_swarm.world.presets import SwarmConfig, make_config, points
+from quad_swarm.world.presets import REAL_TIME, SwarmConfig, make_config, points
 
 PARAMETERS: dict[str, Any] = {
     "policy": "",
     "modules": [],
-    "preset": "flight",
+    "preset": REAL_TIME,
     "world": [],
     "names": [],
     "index": -1,

@@ -595,6 +595,9 @@ PRESETS: dict[str, SwarmConfig] = {
 }
 
 
+REAL_TIME = "flight-v2"  # of robots that are processes, unless something else is named
+
+
 def make_config(
     preset: str | SwarmConfig = "paper", world: Mapping[str, Any] | None = None, **overrides: Any
 ) -> SwarmConfig:

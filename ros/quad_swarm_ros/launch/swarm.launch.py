@@ -13,7 +13,7 @@ ARGUMENTS = {
     "n_robots": ("4", "number of robots"),
     "names": ("", "their names, separated by commas; robot_0, robot_1, ... if empty"),
     "policy": ("full", "a rule, or the folder of an exported model"),
-    "preset": ("flight", "the world"),
+    "preset": ("flight-v2", "the world"),
     "vehicle": ("odometry", "odometry, crazyswarm, crazyswarm_legacy, px4 or aerostack"),
     "scenario": ("symmetric_swap", "where simulated robots start"),
     "plant": ("", "simulated vehicle, such as crazyflow:cf21B_500; the preset's if empty"),
