@@ -16,10 +16,10 @@ packaged model, which was trained in version 2 and with obstacles; set 708 ``see
 ``braking_learned``, ``braking_full``, ``braking_twelve`` and ``braking_sixteen``, full communication and the packaged
 model among obstacles with the braking reserve; set 710 ``five_eight``, ``five_among_eight``, ``five_four``,
 ``five_twelve`` and ``five_sixteen``, the flights that the other seeds need to have 12,000 of eight robots and 4,000 of
-other numbers with the packaged model, and ``rule_again`` and ``none_again``, the best rule and no communication. All
-parts before set 706 fly with equal penalties, those before set 709 without the reserve, as they did. JSON: one row per
-policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run that is ended
-keeps what it has.
+other numbers with the packaged model, ``rule_again`` and ``none_again``, the best rule and no communication, and
+``own_crazyflie`` and ``own_hummingbird``, the packaged model in the foreign simulators. All parts before set 706 fly
+with equal penalties, those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and
+number of robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -133,6 +133,8 @@ PARTS = {
     "braking_full": Part(("full",), tuple(MOST_OBSTACLES), (8, 4), 4000, BRAKING),
     "rule_again": Part((BEST_RULE,), ("symmetric_swap",), (8,), 10000, FIVE),
     "none_again": Part(("none",), ("symmetric_swap",), (8,), 2000, FIVE),
+    "own_crazyflie": Part((OWN_MODEL,), ("symmetric_swap",), (8,), 1000, FIVE, "crazyflow:cf21B_500"),
+    "own_hummingbird": Part((OWN_MODEL,), ("symmetric_swap",), (8,), 1000, FIVE, "rotorpy:hummingbird", "hummingbird"),
     "five_eight": Part(OTHER_SEEDS[2:], tuple(without_obstacles()), (8,), 3000, FIVE),
     "five_among_eight": Part(OTHER_SEEDS, tuple(MOST_OBSTACLES), (8,), 2500, FIVE),
     "five_four": Part(OTHER_SEEDS, EVERYWHERE, (4,), 500, FIVE),
