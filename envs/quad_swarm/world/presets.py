@@ -366,7 +366,7 @@ class SwarmConfig:
         passed = ((f"waypoints[{k}]", one, kept[k : k + 1]) for k, one in enumerate(targets.waypoints))
         for name, one, clear in (("goals", targets.goals, kept), *passed):
             self._check_inside(name, one)
-            self._check_clear(name, one, around, clear, "a robot that keeps its distance cannot be there", stands)
+            self._check_clear(name, one, around, clear, "the planner keeps robots away", stands)
         far = [far_goals(kind) for kind in self.kinds]
         legs = zip(self.kind_of, places, targets.waypoints, targets.goals, strict=True)
         doubtful = {
@@ -483,9 +483,12 @@ class SwarmConfig:
         robot, number = np.unravel_index((found - least[:, None]).argmin(), found.shape)
         needed = least[robot % len(least)]
         if found[robot, number] < needed:
+            distance = float(found[robot, number])
+            where = f"{distance:.3g} m from the surface of" if distance >= 0 else f"{-distance:.3g} m inside"
             raise ValueError(
-                f"{name}[{robot}]={places[robot].tolist()} is {found[robot, number]:.3g} m from the surface of "
-                f"obstacle {number}, where {why}: choose a point at least {needed:.3g} m away"
+                f"{name}[{robot}]={places[robot].tolist()} is {where} obstacle {number} (radius "
+                f"{around.radius[number]:.3g} m, centre {np.round(around.position[number], 3).tolist()}), where {why}: "
+                f"choose a point at least {needed:.3g} m from its surface"
             )
 
     def check_room(self, scenario: str, extent: Extent) -> None:
