@@ -32,6 +32,8 @@ from quad_swarm.world.presets import make_config
 
 # Where the robots hover before, and fly to, a row for each in the order of their numbers (m)
 STARTS, GOALS = np.array([[-2.0, 0, 1.5], [2.0, 0.1, 1.5]]), np.array([[2.0, 0, 1.5], [-2.0, 0, 1.5]])
+# Lowest and highest corner between walls, floor and ceiling (m)
+ROOM = ((-9.0, -9.0, 0.0), (9.0, 9.0, 4.0))
 
 
 class MyVehicle:
@@ -111,17 +113,18 @@ def fly(index, addresses, begins, duration, folder, rule, shared):
         raise SystemExit(f"robot {index}: it would begin in {ahead:.1f} s; give microseconds, in at most ten minutes")
     link = open_link(index, addresses)
     vehicle = MyVehicle(index, config, shared)
-    # For your room: fence, braking and radius must fit between workspace and wall. Below the separation, here halfway
+    # For your room: fence, braking and radius must fit between workspace and walls. Below the separation, here halfway
     # between contact and what planners keep, robots hold their places. At the height `ground`, your vehicle stands.
-    limits = SafetyLimits(fence=0.3, separation=config.radius + config.planner.separation / 2, ground=0.1)
+    near = config.radius + config.planner.separation / 2
+    limits = SafetyLimits(fence=0.3, room=ROOM, separation=near, ground=0.1)
     # `late=` is when set-points act, in periods: measure it, from the start of a period to the motion (0.25 is 12.5 ms)
-    loop = Loop(robot, link, vehicle, limits)
-    loop.warm_up()  # the first time on a machine, it compiles the planner
-    freeze_garbage()
-    begins = link.own(begins)
-    if begins < monotonic():
-        raise SystemExit(f"robot {index}: it was not ready when all begin; give it more time")
     try:
+        loop = Loop(robot, link, vehicle, limits)
+        loop.warm_up()  # the first time on a machine, it compiles the planner
+        freeze_garbage()
+        begins = link.own(begins)
+        if begins < monotonic():
+            raise SystemExit(f"robot {index}: it was not ready when all begin; give it more time")
         state = loop.ready().state
     except ValueError as error:
         raise SystemExit(f"robot {index}: {error}") from None

@@ -10,7 +10,7 @@ from enum import IntEnum
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field, PositiveFloat
+from pydantic import Field, FiniteFloat, PositiveFloat
 
 from quad_swarm.geometry import flattened, length
 from quad_swarm.quadrotor import N_INPUTS, POSITION, VELOCITY
@@ -21,6 +21,7 @@ from quad_swarm.world.presets import SwarmConfig
 HOVERING = np.zeros(N_INPUTS)
 _US = 1e6
 _AT_REST = 0.01  # m/s, rad
+_Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class Mode(IntEnum):
@@ -47,6 +48,8 @@ class SafetyLimits:
     :param separation: distance to another robot below which it holds its place, in the metric of collisions (see
         `SwarmConfig` for robots of unlike radii and for downwash); None for that of a collision
     :param fence: how far it may leave the workspace to the sides and upwards, before it lands; nothing guards downwards
+    :param room: lowest and highest corner between the walls, in the world's frame; `Supervisor` then checks that a
+        robot which is noticed at the fence stops before the walls and the ceiling. None if there are none
     :param hung: time without a sign of life of the loop after which the watchdog levels
     :param landing: climb rate of a landing (m/s), negative. Where the planner's limit of descents is lower, robots land
         with that, and may take longer in proportion
@@ -63,6 +66,7 @@ class SafetyLimits:
     silence: PositiveFloat = 10.0
     separation: Annotated[float, Field(ge=0)] | None = None
     fence: Annotated[float, Field(ge=0)] = 1.0
+    room: tuple[_Corner, _Corner] | None = None
     hung: PositiveFloat = 0.3
     landing: Annotated[float, Field(lt=0, ge=-2)] = -0.5
     ground: float = 0.1
@@ -74,6 +78,37 @@ class SafetyLimits:
             raise ValueError(
                 f"stale={self.stale}, lost={self.lost}, unanswered={self.unanswered}, silence={self.silence}: a robot "
                 "hovers before it lands, so the first of each two must not be the larger one"
+            )
+
+
+def braking_room(config: SwarmConfig, fence: float) -> np.ndarray:
+    """Return how far walls and ceiling must be from the workspace of robots that land when they leave it, (3,) (m).
+
+    To the sides, it is the distance in which robots brake from their speed limit, as `python -m studies.stopping`
+    measures it for the Crazyflie and the Bebop; upwards, that of a climb of 1.5 m/s.
+
+    :param fence: how far outside of the workspace they are noticed (m)
+    """
+    speed = config.planner.max_speed
+    sideways = 0.4 * speed + 0.1 * speed * speed
+    return fence + config.radius + np.array([sideways, sideways, 0.5])
+
+
+def _check_room(config: SwarmConfig, limits: SafetyLimits) -> None:
+    if limits.room is None:
+        return
+    needed, planner = braking_room(config, limits.fence), config.planner
+    below, above = (np.array(planner.workspace_low) - limits.room[0], limits.room[1] - np.array(planner.workspace_high))
+    below[2] = np.inf  # nothing guards downwards
+    for name, gaps, corner in (("workspace_low", below, 0), ("workspace_high", above, 1)):
+        axis = int((gaps - needed).argmin())
+        if gaps[axis] < needed[axis] - 1e-9:
+            slower = "" if axis == 2 else f", lower planner.max_speed={planner.max_speed:g}"
+            raise ValueError(
+                f"limits.room: {gaps[axis]:.3g} m between planner.{name}[{axis}]={getattr(planner, name)[axis]:g} and "
+                f"the wall at {limits.room[corner][axis]:g}, but a robot that is noticed at the fence "
+                f"({limits.fence:g} m) needs {needed[axis]:.3g} m to stop: make the workspace smaller{slower}, or "
+                "lower limits.fence"
             )
 
 
@@ -90,9 +125,11 @@ class Supervisor:
     :param config: the world
     :param limits: when to hover and when to land
     :param robot: number of the robot
+    :raises ValueError: if the room is too small for workspace, fence and braking
     """
 
     def __init__(self, config: SwarmConfig, limits: SafetyLimits, robot: int = 0):
+        _check_room(config.kinds[config.kind_of[robot]], limits)
         fastest = config.kinds[config.kind_of[robot]].planner.descent_rate
         if (slower := limits.landing / -fastest) > 1:
             limits = replace(limits, landing=-fastest, landing_time=slower * limits.landing_time)
