@@ -17,7 +17,7 @@ parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--quick", action="store_true", help="fly for a second only")
 args = parser.parse_args()
 
-config = make_config("paper", n_robots=2)
+config = make_config("flight-v2", n_robots=2)
 planner = make_planner(config.planner, config.quadrotor, config.n_robots)
 starts, goals = np.array([[-2.0, 0, 1], [2.0, 0.1, 1]]), np.array([[2.0, 0, 1], [-2.0, 0, 1]])
 robots = [Robot(config, index, RulePolicy("cpa:1.1s:2"), planner) for index in range(2)]

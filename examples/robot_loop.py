@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from quad_swarm.quadrotor import POSITION, VELOCITY, QuadrotorModel
-from quad_swarm.realtime import Loop, Mode, SafetyLimits, Sensed, Watchdog
+from quad_swarm.realtime import Loop, Mode, SafetyLimits, Sensed, Watchdog, session_of
 from quad_swarm.realtime.link import monotonic
 from quad_swarm.realtime.loop import freeze_garbage
 from quad_swarm.realtime.udp import UdpLink
@@ -82,24 +82,24 @@ def make_robot(index, n_robots, folder, rule):
 def check_team(addresses, config):
     """Refuse addresses, starts and goals that are not one for each robot, in the workspace, and apart."""
     n = config.n_robots
-    if len(set(addresses)) != len(addresses) or len(addresses) != n:
-        raise ValueError(f"--addresses: {len(set(addresses))} different ones for {n} robots; each needs its own")
     if not len(STARTS) == len(GOALS) == n:
         raise ValueError(f"{len(STARTS)} STARTS and {len(GOALS)} GOALS for {n} robots; edit them in {__file__}")
+    if len(set(addresses)) != len(addresses) or len(addresses) != n:
+        raise ValueError(f"--addresses: {len(set(addresses))} different ones for {n} robots; each needs its own")
     config.check_flight(STARTS, GOALS, config.obstacles.listed)
 
 
-def open_link(index, addresses):
+def open_link(index, addresses, session):
     """Return the link of a robot to the others, whose session all share."""
     (host, port), others = addresses[index], {k: a for k, a in enumerate(addresses) if k != index}
     try:
-        return UdpLink(index, others, host, port, session=7)
+        return UdpLink(index, others, host, port, session=session)
     except OSError as error:
         why = f"cannot receive at {host}:{port} ({error.strerror}): --index or --addresses is wrong"
-        raise SystemExit(f"robot {index}: {why}") from None
+        raise SystemExit(f"robot {index}: {why}, or another process still runs") from None
 
 
-def fly(index, addresses, begins, duration, folder, rule, shared):
+def fly(index, addresses, begins, duration, folder, rule, shared, team):
     """Fly one robot to its goal from the time of the day at which all begin (us) on, and land after some time (s).
 
     Return why it landed before, None if it did not."""
@@ -110,8 +110,9 @@ def fly(index, addresses, begins, duration, folder, rule, shared):
         raise SystemExit(f"robot {index}: {error}") from None
     config = robot.config
     if not 0 < (ahead := begins / 1e6 - time.time()) < 600:
-        raise SystemExit(f"robot {index}: it would begin in {ahead:.1f} s; give microseconds, in at most ten minutes")
-    link = open_link(index, addresses)
+        now = time.time_ns() // 1000
+        raise SystemExit(f"robot {index}: --begins {begins} is {ahead:.1f} s from now, {now} us; choose 1 to 600 s")
+    link = open_link(index, addresses, session_of(config, team))
     vehicle = MyVehicle(index, config, shared)
     # For your room: fence, braking and radius must fit between workspace and walls. Below the separation, here halfway
     # between contact and what planners keep, robots hold their places. At the height `ground`, your vehicle stands.
@@ -209,6 +210,7 @@ if __name__ == "__main__":
     parser.add_argument("--duration", type=float, default=6.0, metavar="S", help="when to land, after that")
     parser.add_argument("--files", metavar="FOLDER", help="an exported policy and its world")
     parser.add_argument("--rule", help="a rule instead of the exported policy, such as none")
+    parser.add_argument("--team", type=int, default=0, help="number of the team, if several share a network")
     parser.add_argument("--shared", metavar="FILE", help="states of the simulated vehicles")
     parser.add_argument("--quick", action="store_true", help="fly for a second only")
     args = parser.parse_args()
@@ -219,8 +221,10 @@ if __name__ == "__main__":
             parser.error("--addresses, --begins and --shared need --index: which robot is this one?")
         rule = args.rule if args.files else args.rule or "cpa:1.1s:2"  # asks those whom it would come close to
         sys.exit(fly_all(1.0 if args.quick else args.duration, args.files, rule))
-    if args.addresses is None or args.begins is None or not (args.files or args.rule):
-        parser.error("--index needs --addresses, --begins, and --files (or --rule, in the world flight-v2)")
+    if args.addresses is None or args.begins is None:
+        parser.error("--index needs --addresses and --begins")
+    if not args.files and not (args.rule and args.shared):
+        parser.error("--index needs --files, which holds the world of your robots, also with --rule")
     if not 0 <= args.index < len(args.addresses):
         parser.error(f"--index {args.index}: there are {len(args.addresses)} addresses, from 0")
-    sys.exit(fly(args.index, args.addresses, args.begins, args.duration, args.files, args.rule, args.shared))
+    sys.exit(fly(args.index, args.addresses, args.begins, args.duration, args.files, args.rule, args.shared, args.team))

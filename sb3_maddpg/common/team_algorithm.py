@@ -645,6 +645,11 @@ class TeamAlgorithm(SavesSafely, SavesReplayBuffer):
                 f"Nothing was learned: learning_starts={self.learning_starts}, and there were {self.num_timesteps} "
                 "steps. Train for more steps, or start earlier."
             )
+        elif self.verbose and not self._episode_num:
+            print(
+                f"No episode ended in {self.num_timesteps} steps, so no return is logged. Train for more steps, or let "
+                "the environment end its episodes, such as by truncation after a number of steps."
+            )
         return self
 
     def _seeds_of_env(self) -> Any:

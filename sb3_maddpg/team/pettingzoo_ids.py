@@ -67,6 +67,12 @@ def unknown(env_id: str) -> str:
     """
     module = module_of(env_id)
     named = all(part.isidentifier() for part in module.split("."))
+    file, _, attribute = module.replace(":", ".").rpartition(".")
+    if file.isidentifier() and isinstance(getattr(find_module(file), attribute, None), type):
+        return (
+            f"Unknown environment '{env_id}': ids are names of modules. Add `parallel_env = {attribute}` to {file}.py, "
+            f"and use the id '{file}'."
+        )
     if named and (found := find_module(module)) and not hasattr(found, "__path__"):
         return (
             f"{module.replace('.', '/')}.py has no function parallel_env, which creates a PettingZoo environment: add "

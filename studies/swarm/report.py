@@ -521,7 +521,7 @@ def glance_table(rows: Rows, orca: Rows) -> str:
         "[ORCA](docs/planner.md#without-messages-orca-and-voronoi-cells)": [
             row for row in orca if hardest(row, 8) and row["preset"] == "flight-v2"
         ],
-        f"best of {RULES_TRIED} rules": [row for row in here if row["policy"] == BEST_RULE],
+        f"best of {RULES_TRIED} rules, found in version 1": [row for row in here if row["policy"] == BEST_RULE],
         f"**learned**, {len({row['policy'] for row in learned})} training seeds together": learned,
     }
     full = _weighted(groups["everybody tells everybody"], "steps_to_arrival", "arrived")

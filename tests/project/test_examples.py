@@ -71,10 +71,17 @@ def test_a_robot_refuses_goals_that_no_team_can_fly_to(goals, message):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--index", "0", "--addresses", "127.0.0.1:5", "127.0.0.1:5"], "1 different ones for 2 robots"),
-        (["--index", "0", "--addresses", "203.0.113.9:5", "127.0.0.1:6"], "cannot receive at 203.0.113.9:5"),
+        (
+            ["--index", "0", "--shared=x", "--addresses", "127.0.0.1:5", "127.0.0.1:5"],
+            "1 different ones for 2 robots",
+        ),
+        (
+            ["--index", "0", "--shared=x", "--addresses", "203.0.113.9:5", "127.0.0.1:6"],
+            "cannot receive at 203.0.113.9:5",
+        ),
         (["--index", "0", "--addresses", "127.0.0.1:99999"], "with a port up to 65535"),
         (["--addresses", "127.0.0.1:5", "127.0.0.1:6"], "which robot is this one?"),
+        (["--index", "0", "--addresses", "127.0.0.1:5", "127.0.0.1:7"], "--index needs --files"),
         (["--duration", "-5"], "--duration -5: it must be a number above 0"),
     ],
 )

@@ -31,9 +31,11 @@ def export(model: str, config: SwarmConfig, folder: Path, algo: str = "sb3_maddp
     :param folder: folder to write to
     :param algo: ``module:Class`` that loads the model
     :return: what has been written, as a robot loads it
-    :raises ValueError: if the model does not fit the world, robots cannot fly by themselves in it, or the extra
-        ``onnx`` is not installed
+    :raises ValueError: if the model does not fit the world, robots cannot fly by themselves in it, the folder holds
+        an export for another world, or the extra ``onnx`` is not installed
     """
+    if _holds_another_world(folder, config):
+        raise ValueError(f"{folder} holds an export for another world: choose another folder, or remove it.")
     if config.is_limited:
         raise ValueError("neighbourhood: a robot of its own perceives all others; leave it out.")
     loaded = load_model(model, algo)
@@ -64,6 +66,13 @@ def export(model: str, config: SwarmConfig, folder: Path, algo: str = "sb3_maddp
         for name in (files.ACTOR, files.DESCRIPTION):
             shutil.move(part / name, folder / name)
     return files.load(folder)
+
+
+def _holds_another_world(folder: Path, config: SwarmConfig) -> bool:
+    try:
+        return files.load(folder).config != config
+    except ValueError:  # nothing, or what the loader asks to replace by another export
+        return False
 
 
 def make_parser() -> Parser:

@@ -278,6 +278,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _write(args: argparse.Namespace) -> None:
     if args.episode < 0:
         raise ValueError(f"--episode {args.episode}: episodes count from 0.")
+    if args.out.suffix.lower() not in ("", ".html", ".htm") and not args.out.is_char_device():
+        raise ValueError(f"--out {args.out}: what is written is a web page; use the ending .html.")
     check_writable(args.out, "--out")
     if bool(args.flight) == bool(args.policy):
         raise ValueError("pass either policies to fly (--policy) or recorded flights (--flight).")

@@ -3,7 +3,7 @@
 Imports what `quad_swarm.robot` does, neither PyTorch nor Gymnasium.
 """
 
-from quad_swarm.realtime.link import Channel, Conditions, Handler, Link, Sensed, Vehicle, WireLink
+from quad_swarm.realtime.link import Channel, Conditions, Handler, Link, Sensed, Vehicle, WireLink, session_of
 from quad_swarm.realtime.loop import Loop
 from quad_swarm.realtime.supervisor import Mode, SafetyLimits, Supervisor, Watchdog
 
@@ -20,4 +20,5 @@ __all__ = [
     "Vehicle",
     "Watchdog",
     "WireLink",
+    "session_of",
 ]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, Protocol, TypeVar, cast
@@ -13,6 +16,7 @@ from pydantic import Field
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.robot import Plan, wire
 from quad_swarm.validation import checked
+from quad_swarm.world.presets import SwarmConfig
 
 T = TypeVar("T")
 
@@ -178,11 +182,22 @@ class BaseLink:
         return of_day(0) + self.clock_error
 
 
+def session_of(config: SwarmConfig, team: int = 0) -> int:
+    """Return a session that robots of the same world share: messages of a robot that flies in another one, with other
+    lengths, limits or obstacles, are refused, but for one world in 256.
+
+    :param config: the world
+    :param team: tells apart teams in the same world on one channel
+    """
+    world = json.dumps(dataclasses.asdict(config), sort_keys=True)
+    return (zlib.crc32(world.encode()) + team) % 256
+
+
 class WireLink(BaseLink):
     """A link whose messages are those of `quad_swarm.robot.wire`.
 
     :param index: number of the robot
-    :param session: tells apart teams and flights on one channel, 0 to 255
+    :param session: tells apart teams and flights on one channel, 0 to 255, see `session_of`
     :param checked: whether messages carry a checksum, for radios that have none
     """
 

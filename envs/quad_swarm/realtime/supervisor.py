@@ -21,6 +21,7 @@ from quad_swarm.world.presets import SwarmConfig
 HOVERING = np.zeros(N_INPUTS)
 _US = 1e6
 _AT_REST = 0.01  # m/s, rad
+_DEEPEST = 5.0  # of the ground below the workspace (m)
 _Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
@@ -59,15 +60,15 @@ class SafetyLimits:
     :raises ValueError: if a value is out of range, or a state would be lost before it is stale
     """
 
-    stale: PositiveFloat = 0.2
-    lost: PositiveFloat = 1.0
-    frozen: PositiveFloat = 0.2
-    unanswered: PositiveFloat = 1.0
-    silence: PositiveFloat = 10.0
+    stale: Annotated[float, Field(gt=0, le=5)] = 0.2
+    lost: Annotated[float, Field(gt=0, le=30)] = 1.0
+    frozen: Annotated[float, Field(gt=0, le=5)] = 0.2
+    unanswered: Annotated[float, Field(gt=0, le=60)] = 1.0
+    silence: Annotated[float, Field(gt=0, le=600)] = 10.0
     separation: Annotated[float, Field(ge=0)] | None = None
-    fence: Annotated[float, Field(ge=0)] = 1.0
+    fence: Annotated[float, Field(ge=0, le=10)] = 1.0
     room: tuple[_Corner, _Corner] | None = None
-    hung: PositiveFloat = 0.3
+    hung: Annotated[float, Field(gt=0, le=5)] = 0.3
     landing: Annotated[float, Field(lt=0, ge=-2)] = -0.5
     ground: float = 0.1
     settled: PositiveFloat = 0.3
@@ -92,6 +93,21 @@ def braking_room(config: SwarmConfig, fence: float) -> np.ndarray:
     speed = config.planner.max_speed
     sideways = 0.4 * speed + 0.1 * speed * speed
     return fence + config.radius + np.array([sideways, sideways, 0.5])
+
+
+def _check_heights_and_distances(config: SwarmConfig, limits: SafetyLimits) -> None:
+    lowest, planner = config.planner.workspace_low[2], config.planner
+    if not lowest - _DEEPEST <= limits.ground < lowest:
+        raise ValueError(
+            f"limits.ground={limits.ground:g} m: a robot stops its motors there, so it must be below the workspace "
+            f"(planner.workspace_low[2]={lowest:g}), by at most {_DEEPEST:g} m"
+        )
+    contact = 2 * config.radius - config.collision_tolerance
+    if limits.separation is not None and not contact <= limits.separation <= planner.separation:
+        raise ValueError(
+            f"limits.separation={limits.separation:g} m: robots hold their places below it, so it must be at least "
+            f"that of contact ({contact:g}) and at most planner.separation={planner.separation:g}"
+        )
 
 
 def _check_room(config: SwarmConfig, limits: SafetyLimits) -> None:
@@ -125,12 +141,15 @@ class Supervisor:
     :param config: the world
     :param limits: when to hover and when to land
     :param robot: number of the robot
-    :raises ValueError: if the room is too small for workspace, fence and braking
+    :raises ValueError: if the limits do not fit the world: robots would land in the air, hold their places at the
+        distance that they keep or touch before they do, or the room is too small for workspace, fence and braking
     """
 
     def __init__(self, config: SwarmConfig, limits: SafetyLimits, robot: int = 0):
-        _check_room(config.kinds[config.kind_of[robot]], limits)
-        fastest = config.kinds[config.kind_of[robot]].planner.descent_rate
+        kind = config.kinds[config.kind_of[robot]]
+        _check_heights_and_distances(kind, limits)
+        _check_room(kind, limits)
+        fastest = kind.planner.descent_rate
         if (slower := limits.landing / -fastest) > 1:
             limits = replace(limits, landing=-fastest, landing_time=slower * limits.landing_time)
         self.limits = limits

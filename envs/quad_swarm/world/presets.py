@@ -113,7 +113,7 @@ class SwarmConfig:
         if self.planner.separation < 2 * self.radius:
             raise ValueError(
                 f"planner.separation={self.planner.separation}: it must be at least 2 * radius = {2 * self.radius}, "
-                "or left out of `make_config` to follow the radius"
+                "or left out to follow the radius"
             )
         if self.vehicles:
             self._check_vehicles()
@@ -236,7 +236,7 @@ class SwarmConfig:
         if self.space.spacing < contact - self.collision_tolerance:
             raise ValueError(
                 f"space.spacing={self.space.spacing:g}: robots would start or stop in contact; it must be at least "
-                f"2 * radius = {contact:g}, or left out of `make_config` to follow the separation"
+                f"2 * radius = {contact:g}, or left out to follow the separation"
             )
         for name, reach, does in (
             ("neighbourhood.range", self.neighbourhood.range, "robots must perceive others"),

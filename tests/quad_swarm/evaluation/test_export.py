@@ -57,6 +57,17 @@ def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_an_export_is_not_replaced_by_one_for_another_world(tmp_path):
+    export(MODEL, make_config("flight", n_robots=2), tmp_path)
+    before = (tmp_path / files.DESCRIPTION).read_bytes()
+    with pytest.raises(ValueError, match="holds an export for another world"):
+        export(MODEL, make_config("flight", n_robots=2, radius=0.15), tmp_path)
+    assert (tmp_path / files.DESCRIPTION).read_bytes() == before
+    (tmp_path / files.DESCRIPTION).write_text("damaged")
+    export(MODEL, make_config("flight", n_robots=2, radius=0.15), tmp_path)
+    assert load(tmp_path).config.radius == 0.15
+
+
 @pytest.mark.slow
 def test_programs_answer_as_the_model_without_what_critics_see(tmp_path):
     config = make_config("flight", n_robots=3)

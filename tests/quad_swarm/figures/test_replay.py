@@ -85,6 +85,8 @@ def test_mistakes_are_told_in_one_line(tmp_path, capsys):
     assert "symmetric_swap" in capsys.readouterr().err
     assert main(["--policy", "full", "--episode", "-1", *out]) == 1
     assert "count from 0" in capsys.readouterr().err
+    assert main(["--policy", "full", "--out", str(tmp_path / "replay.mp3")]) == 1
+    assert "use the ending .html" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from quad_swarm.realtime import Channel, Conditions, WireLink
+from quad_swarm.realtime import Channel, Conditions, WireLink, session_of
 from quad_swarm.realtime.link import Traffic, sensed_together
 from quad_swarm.robot import Plan, wire
+from quad_swarm.world.presets import make_config
 
 PLAN = Plan(1_000_000, np.arange(21)[:, None] * np.array([0.1, 0.05, 0.0]))
 
@@ -105,6 +106,17 @@ def test_reordered_messages_arrive_after_the_next_one():
 def test_shares_are_shares(conditions):
     with pytest.raises(ValueError, match=next(iter(conditions))):
         Conditions(**conditions)
+
+
+def test_robots_of_another_world_have_another_session():
+    config = make_config("flight-v2", n_robots=3)
+    assert session_of(config) == session_of(make_config("flight-v2", n_robots=3)) != session_of(config, team=1)
+    others = [
+        make_config(config, radius=0.2),
+        make_config(config, obstacles={"listed": [{"position": (0, 0, 0), "radius": 0.3}]}),
+    ]
+    assert len({session_of(one) for one in (config, *others)}) == 3
+    assert all(0 <= session_of(config, team) < 256 for team in range(300))
 
 
 @pytest.mark.parametrize(("stamps", "at"), [([900_000, 1_100_000], 1_000_000), ([700_000, 990_000], 700_000)])

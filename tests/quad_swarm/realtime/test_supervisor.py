@@ -145,8 +145,8 @@ def test_robots_that_touch_hover():
     for gap, mode in ((0.01, Mode.FLY), (-0.01, Mode.HOVER)):
         others = np.array([[0, contact + gap, 1.5], [3, 0, 1.5]])
         assert modes(supervisor, [lambda now, others=others: sensed(now, others=others)]) == [mode]
-    supervisor = Supervisor(CONFIG, SafetyLimits(separation=2.0))
-    assert modes(supervisor, [lambda now: sensed(now, others=np.array([[1.9, 0, 1.5], [3, 0, 1.5]]))]) == [Mode.HOVER]
+    supervisor = Supervisor(CONFIG, SafetyLimits(separation=0.7))
+    assert modes(supervisor, [lambda now: sensed(now, others=np.array([[0.69, 0, 1.5], [3, 0, 1.5]]))]) == [Mode.HOVER]
 
 
 @pytest.mark.parametrize(("robot", "reach"), [(0, (0.5, 0.7)), (1, (0.5, 0.8)), (2, (0.7, 0.8))])
@@ -198,6 +198,26 @@ class Recorder:
     def command(self, setpoint, plan):
         self.commands.append(setpoint)
         (self.levelled if setpoint[2] == 0 else self.lands).set()
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"ground": 1.2}, r"limits\.ground=1\.2 m: .* \(planner\.workspace_low\[2\]=0\.48\)"),
+        ({"ground": -6.0}, r"limits\.ground=-6 m: .* at most 5 m"),
+        ({"separation": 0.3}, r"limits\.separation=0\.3 m: .* contact \(0\.599\)"),
+        ({"separation": 4.0}, r"limits\.separation=4 m: .* planner\.separation=0\.8"),
+    ],
+)
+def test_limits_that_do_not_fit_the_world_are_refused(limits, message):
+    with pytest.raises(ValueError, match=message):
+        Supervisor(CONFIG, SafetyLimits(**limits))
+
+
+@pytest.mark.parametrize("limits", [{"fence": 300.0}, {"stale": 200.0, "lost": 1000.0}, {"hung": 300.0}])
+def test_limits_in_other_units_are_refused(limits):
+    with pytest.raises(ValueError, match="less than or equal to"):
+        SafetyLimits(**limits)
 
 
 def test_a_robot_that_leaves_the_workspace_stops_before_the_walls():

@@ -105,6 +105,14 @@ def test_a_training_that_ends_before_it_learns_says_so(capsys):
     assert "Nothing was learned" not in capsys.readouterr().out
 
 
+def test_a_training_in_which_no_episode_ends_says_so(capsys):
+    learned = MADDPG("MlpPolicy", OwnBit(), learning_starts=1, train_freq=1, batch_size=4, buffer_size=100, verbose=1)
+    learned.learn(2)
+    assert "No episode ended in 2 steps" in capsys.readouterr().out
+    learned.learn(200)
+    assert "No episode ended" not in capsys.readouterr().out
+
+
 def test_a_progress_bar_stands_alone(capsys):
     assert train("--progress", "-tb", "tb") == 0
     out = capsys.readouterr().out

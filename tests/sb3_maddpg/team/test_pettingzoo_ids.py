@@ -52,6 +52,14 @@ def test_arguments_are_those_of_the_module():
     assert "mpe2/simple_tag_v3" in pettingzoo_ids.siblings("mpe2/simple_tig_v3")
 
 
+@pytest.mark.parametrize("env_id", ["rescue_team/Rescue", "rescue_team:Rescue"])
+def test_a_class_is_no_environment_id_and_the_message_says_what_to_add(env_id, tmp_path, monkeypatch):
+    (tmp_path / "rescue_team.py").write_text("class Rescue: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    message = pettingzoo_ids.unknown(env_id)
+    assert message.endswith("Add `parallel_env = Rescue` to rescue_team.py, and use the id 'rescue_team'.")
+
+
 @pytest.mark.usefixtures("registry")
 def test_a_file_in_the_present_folder_is_an_environment_id(tmp_path, monkeypatch):
     (tmp_path / "flat_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")
