@@ -397,7 +397,7 @@ def _readable(message: str) -> str:
 def _names(owner: Any, path: Sequence[str] = ()) -> list[str]:
     """Return the names of a function's parameters, or of the fields of the dataclass at ``path`` in a dataclass."""
     if not dataclasses.is_dataclass(owner):
-        return list(inspect.signature(owner).parameters)
+        return [name for name in inspect.signature(owner).parameters if name != "self"]
     for name in path:
         if not name.isdigit():  # an entry of a list
             owner = _dataclass_in(get_type_hints(owner)[name])

@@ -91,7 +91,7 @@ def load_vehicle(name: str | os.PathLike[str]) -> QuadrotorParams:
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror or error}.") from None
     except (ValueError, TypeError, KeyError) as error:
-        why = "it has no `parameters`" if isinstance(error, KeyError) else shown(str(error))
+        why = "it has no `parameters`" if isinstance(error, (KeyError, TypeError)) else shown(str(error))
         raise ValueError(
             f"{path} is not a vehicle file ({why}): `sb3-maddpg identify --out` writes one, with the "
             "vehicle's values under `parameters`."

@@ -12,11 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, PercentFormatter
 
 from quad_swarm.evaluation.flight import Flight, fly
+from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.figures.colours import COLOURS, INK, LEARNED, RULES, STYLE
 from quad_swarm.figures.plots import draw_flight, explain_flights
+from quad_swarm.plants.base import MODEL
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import without_obstacles
+from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import condition, progress
 from studies.swarm.protocol import EARLIER
 
@@ -28,6 +31,33 @@ Rows = list[dict[str, Any]]
 def rate_of(row: dict[str, Any]) -> float:
     """Return the fraction of episodes with a collision."""
     return row["collisions"] / row["episodes"]
+
+
+def merged(rows: Rows) -> dict[str, Any]:
+    """Count the rows of a policy in several sets together.
+
+    :return: ``policy``, ``episodes``, ``collisions`` with the interval of their rate, ``request_share``, ``arrived``
+        and ``steps_to_arrival``, None if nobody arrived
+    """
+    episodes, collisions, arrived = (sum(row[key] for row in rows) for key in ("episodes", "collisions", "arrived"))
+    low, high = wilson_interval(collisions, episodes)
+    steps = sum(row["arrived"] * (row["steps_to_arrival"] or 0.0) for row in rows)
+    return {
+        "policy": rows[0]["policy"],
+        "episodes": episodes,
+        "collisions": collisions,
+        "collision_low": low,
+        "collision_high": high,
+        "request_share": sum(row["episodes"] * row["request_share"] for row in rows) / episodes,
+        "arrived": arrived,
+        "steps_to_arrival": steps / arrived if arrived else None,
+    }
+
+
+def by_policy(rows: Rows) -> Rows:
+    """Return a row for each policy, see `merged`."""
+    names = dict.fromkeys(row["policy"] for row in rows)
+    return [merged([row for row in rows if row["policy"] == name]) for name in names]
 
 
 @rc_context(STYLE)
@@ -140,15 +170,72 @@ def draw_flight_fronts(tried: Rows, twelve: Rows, sixteen: Rows, path: Path) -> 
         axes.set_title(f"{'Eight' if n == 8 else 'Sixteen'} robots, symmetric swap")
         axes.set_xscale("log")
         axes.set_xlim(2e-3, 1.3)
-        axes.set_yscale("symlog", linthresh=1e-3)
-        axes.set_ylim(-1e-4, 1)
-        axes.xaxis.set_major_locator(FixedLocator([0.003, 0.01, 0.03, 0.1, 0.3, 1]))
-        axes.xaxis.set_minor_locator(FixedLocator([]))
-        axes.yaxis.set_major_locator(FixedLocator([0, 1e-3, 1e-2, 1e-1, 1]))
-        axes.yaxis.set_minor_locator(FixedLocator([]))
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(lambda share, _: f"{100 * share:.4g}%")
-        axes.set_xlabel("plans sent, of all possible")
+        _share_axes(axes, [0.003, 0.01, 0.03, 0.1, 0.3, 1])
+    _finish(figure, panels, path)
+
+
+@rc_context(STYLE)
+def draw_version_2(sealed: Rows, orca: Rows, tried: Rows, path: Path) -> None:
+    """Draw plans sent against collisions in the symmetric swap of `flight-v2`, with a panel for each number of robots.
+
+    :param sealed: rows of `studies.swarm.version2`
+    :param orca: rows of ORCA
+    :param tried: rows of rules, and of the packaged model at other thresholds, on validation episodes
+    :param path: path of the figure
+    """
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, n in zip(panels, (8, 16), strict=True):
+        tries, flown = ([row for row in rows if hardest(row, n)] for rows in (tried, sealed))
+        flown = by_policy([row for row in flown if row["plant"] == MODEL])
+        rules = [row for row in tries if "pretrained:" not in row["policy"] and row["policy"] != "none"]
+        axes.plot(
+            [row["request_share"] for row in rules],
+            [rate_of(row) for row in rules],
+            ".",
+            color=RULES,
+            markersize=5,
+            alpha=0.6,
+            label="hand-made rules, 100 to 200 trial flights",
+        )
+        curve = sorted((r for r in tries if "pretrained:" in r["policy"]), key=lambda row: row["request_share"])
+        axes.plot(
+            [row["request_share"] for row in curve],
+            [rate_of(row) for row in curve],
+            ".-",
+            color=LEARNED,
+            alpha=0.6,
+            label="the packaged model at other thresholds",
+        )
+        silent = [row for row in orca if hardest(row, n) and row["preset"] == "flight-v2"]
+        _points(axes, by_policy(silent), "^", COLOURS[2], "ORCA, no messages")
+        _points(axes, [row for row in flown if row["policy"] == BEST_RULE], "D", INK, "best rule of version 1, sealed")
+        none = [row for row in flown if row["policy"] == "none"]
+        _points(axes, none, "X", RULES, "no communication, sealed")
+        learned = [r for r in flown if "flight-v2" in r["policy"] or "flight_v2_seed" in r["policy"]]
+        _points(axes, learned, "*", LEARNED, "learned, a mark for each training seed, sealed")
+        full = [row for row in flown if row["policy"] == "full"]
+        _points(axes, full, "s", COLOURS[0], "full communication, sealed")
+        axes.set_title(f"{'Eight' if n == 8 else 'Sixteen'} robots, symmetric swap")
+        axes.set_xscale("symlog", linthresh=0.003)
+        axes.set_xlim(-0.0005, 1.3)
+        _share_axes(axes, [0, 0.003, 0.01, 0.03, 0.1, 0.3, 1])
+    _finish(figure, panels, path)
+
+
+def _share_axes(axes: Axes, ticks: Sequence[float]) -> None:
+    axes.set_yscale("symlog", linthresh=1e-3)
+    axes.set_ylim(-1e-4, 1)
+    axes.xaxis.set_major_locator(FixedLocator(ticks))
+    axes.xaxis.set_minor_locator(FixedLocator([]))
+    axes.yaxis.set_major_locator(FixedLocator([0, 1e-3, 1e-2, 1e-1, 1]))
+    axes.yaxis.set_minor_locator(FixedLocator([]))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda share, _: f"{100 * share:.4g}%")
+    axes.set_xlabel("plans sent, of all possible")
+
+
+def _finish(figure: Figure, panels: Sequence[Axes], path: Path) -> None:
     panels[0].set_ylabel("flights with a collision (linear below 0.1 %)")
     handles = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)

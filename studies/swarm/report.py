@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from quad_swarm.evaluation.flight import Flight
-from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison, wilson_interval
+from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.plants.base import MODEL
@@ -26,12 +26,15 @@ from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import absolute_path
 from studies.swarm.figures import (
     NAMES,
+    by_policy,
     draw_asking,
     draw_flight_fronts,
     draw_fronts,
     draw_trajectories,
+    draw_version_2,
     flights,
     hardest,
+    merged,
     rate_of,
 )
 from studies.swarm.fly import PAPERS
@@ -524,32 +527,18 @@ def glance_table(rows: Rows, orca: Rows) -> str:
         f"best of {RULES_TRIED} rules, found in version 1": [row for row in here if row["policy"] == BEST_RULE],
         f"**learned**, {len({row['policy'] for row in learned})} training seeds together": learned,
     }
-    full = _weighted(groups["everybody tells everybody"], "steps_to_arrival", "arrived")
+    full = merged(groups["everybody tells everybody"])["steps_to_arrival"]
     lines = []
     for what, chosen in groups.items():
-        by_seed = [[row for row in chosen if row["policy"] == one] for one in sorted({row["policy"] for row in chosen})]
-        sent = sorted(_weighted(one, "request_share", "episodes") for one in by_seed)
-        times = sorted(_weighted(one, "steps_to_arrival", "arrived") / full - 1 for one in by_seed)
-        later = spread([f"+{time:.0%}" for time in times])
+        each, together = by_policy(chosen), merged(chosen)
+        sent = sorted(one["request_share"] for one in each)
+        later = spread([f"+{time / full - 1:.0%}" for time in sorted(one["steps_to_arrival"] for one in each)])
         if what == "nobody tells anybody":  # only those arrive there that met nobody
             later = "-"
-        elif what == "everybody tells everybody":
+        elif together["policy"] == FULL:
             later = f"{full * PRESETS['flight-v2'].planner.dt:.1f} s"
-        lines.append([what, together(chosen), spread([f"{share:.1%}" for share in sent]), later])
+        lines.append([what, seeds_rate([together]), spread([f"{share:.1%}" for share in sent]), later])
     return table(["", "flights with a collision", "plans sent", "arrival, beside full"], lines)
-
-
-def _weighted(rows: Rows, name: str, by: str) -> float:
-    return float(np.average([row[name] for row in rows], weights=[row[by] for row in rows]))
-
-
-def together(rows: Rows) -> str:
-    """Format the collisions in all rows, with the interval of their rate."""
-    collisions, episodes = (sum(row[name] for row in rows) for name in ("collisions", "episodes"))
-    low, high = (100 * end for end in wilson_interval(collisions, episodes))
-    # Narrow columns would break lines anywhere
-    lines = (f"{collisions:,} of {episodes:,}", f"[{low:.2f}, {high:.2f}] %")
-    return "<br>".join(line.replace(" ", "&nbsp;") for line in lines)
 
 
 def seeds_rate(rows: Rows) -> str:
@@ -708,6 +697,8 @@ def main() -> None:
         tried = [*rows["flight_tuning"], *read_rows(args.data / "flight_sixteen.json.gz")]
         sealed = rows["flight"], rows["flight_sixteen_sealed"]
         draw_flight_fronts(tried, *sealed, args.images / "front_flight.png")
+    sealed_2, orca, tried_2 = (read_rows(VERSION_2 / f"{name}.json") for name in ("version2", "orca", "front"))
+    draw_version_2(sealed_2, orca, tried_2, args.images / "front_version_2.png")
     if flown:
         draw_trajectories(flown, args.images / "flights.png")
     if asking:

@@ -39,6 +39,12 @@ def function(number: PositiveInt, text: str | Mapping[str, float] = "", **others
     return number, text, others
 
 
+class Taker:
+    @checked_arguments
+    def take(self, number: int = 0) -> int:
+        return number
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -46,6 +52,7 @@ def function(number: PositiveInt, text: str | Mapping[str, float] = "", **others
         (lambda: Inner(count=0), "count=0: it must be greater than 0."),
         (lambda: Inner(cuont=0), "Unknown Inner parameter 'cuont'; known: count, pair. Did you mean 'count'?"),
         (lambda: Outer(Inner(count=2), True), "flag=True goes with inner.count=1 alone."),
+        (lambda: Taker().take(numbr=1), "Unknown argument 'numbr'; known: number. Did you mean 'number'?"),
         (lambda: replaced(Outer(), {"inner": {"count": 0}}), "inner.count=0: it must be greater than 0."),
         (lambda: replaced(Inner(), {"count": 0}, "there"), "there.count=0: it must be greater than 0."),
         (lambda: function(0), "number=0: it must be greater than 0."),

@@ -21,7 +21,7 @@ from quad_swarm.world.presets import SwarmConfig
 HOVERING = np.zeros(N_INPUTS)
 _US = 1e6
 _AT_REST = 0.01  # m/s, rad
-_DEEPEST = 5.0  # of the ground below the workspace (m)
+_GROUND, _DEEPEST = 0.3, 5.0  # heights of the ground in a workspace, and depth below it (m)
 _Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
@@ -60,15 +60,15 @@ class SafetyLimits:
     :raises ValueError: if a value is out of range, or a state would be lost before it is stale
     """
 
-    stale: Annotated[float, Field(gt=0, le=5)] = 0.2
-    lost: Annotated[float, Field(gt=0, le=30)] = 1.0
-    frozen: Annotated[float, Field(gt=0, le=5)] = 0.2
+    stale: Annotated[float, Field(gt=0, le=60)] = 0.2
+    lost: Annotated[float, Field(gt=0, le=60)] = 1.0
+    frozen: Annotated[float, Field(gt=0, le=60)] = 0.2
     unanswered: Annotated[float, Field(gt=0, le=60)] = 1.0
     silence: Annotated[float, Field(gt=0, le=600)] = 10.0
     separation: Annotated[float, Field(ge=0)] | None = None
     fence: Annotated[float, Field(ge=0, le=10)] = 1.0
     room: tuple[_Corner, _Corner] | None = None
-    hung: Annotated[float, Field(gt=0, le=5)] = 0.3
+    hung: Annotated[float, Field(gt=0, le=60)] = 0.3
     landing: Annotated[float, Field(lt=0, ge=-2)] = -0.5
     ground: float = 0.1
     settled: PositiveFloat = 0.3
@@ -97,10 +97,11 @@ def braking_room(config: SwarmConfig, fence: float) -> np.ndarray:
 
 def _check_heights_and_distances(config: SwarmConfig, limits: SafetyLimits) -> None:
     lowest, planner = config.planner.workspace_low[2], config.planner
-    if not lowest - _DEEPEST <= limits.ground < lowest:
+    deepest, highest = min(lowest, 0.0) - _DEEPEST, max(lowest, _GROUND)
+    if not deepest <= limits.ground <= highest:
         raise ValueError(
-            f"limits.ground={limits.ground:g} m: a robot stops its motors there, so it must be below the workspace "
-            f"(planner.workspace_low[2]={lowest:g}), by at most {_DEEPEST:g} m"
+            f"limits.ground={limits.ground:g} m: a robot that lands stops its motors there; with "
+            f"planner.workspace_low[2]={lowest:g}, it must be {deepest:g} to {highest:g} m"
         )
     contact = 2 * config.radius - config.collision_tolerance
     if limits.separation is not None and not contact <= limits.separation <= planner.separation:

@@ -203,8 +203,8 @@ class Recorder:
 @pytest.mark.parametrize(
     ("limits", "message"),
     [
-        ({"ground": 1.2}, r"limits\.ground=1\.2 m: .* \(planner\.workspace_low\[2\]=0\.48\)"),
-        ({"ground": -6.0}, r"limits\.ground=-6 m: .* at most 5 m"),
+        ({"ground": 1.2}, r"limits\.ground=1\.2 m: .* must be -5 to 0\.48 m"),
+        ({"ground": -6.0}, r"limits\.ground=-6 m: .* planner\.workspace_low\[2\]=0\.48, .* -5 to"),
         ({"separation": 0.3}, r"limits\.separation=0\.3 m: .* contact \(0\.599\)"),
         ({"separation": 4.0}, r"limits\.separation=4 m: .* planner\.separation=0\.8"),
     ],

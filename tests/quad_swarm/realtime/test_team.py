@@ -34,7 +34,7 @@ def test_what_is_written_is_read(tmp_path):
         ({"wait": "long"}, "wait"),
         ({"priority": 100}, "priority=100"),
         ({"clock_errors": [0.1]}, "clock_errors"),
-        ({"limits": {"stale": 4.0}}, "hovers before it lands"),
+        ({"limits": {"stale": 9.0}}, "hovers before it lands"),
         ({"limits": {"patience": 1.0}}, "patience"),
         ({"config": {"n_robots": 1}}, "n_robots"),
         ({"conditions": {"loss": 2}}, "loss"),
