@@ -183,7 +183,7 @@ def draw_version_2(sealed: Rows, orca: Rows, tried: Rows, path: Path) -> None:
     :param tried: rows of rules, and of the packaged model at other thresholds, on validation episodes
     :param path: path of the figure
     """
-    figure = Figure(figsize=(8, 4), layout="constrained")
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, n in zip(panels, (8, 16), strict=True):
         tries, flown = ([row for row in rows if hardest(row, n)] for rows in (tried, sealed))
