@@ -198,7 +198,8 @@ def draw_version_2(sealed: Rows, orca: Rows, tried: Rows, path: Path) -> None:
             alpha=0.6,
             label="hand-made rules, 100 to 200 trial flights",
         )
-        curve = sorted((r for r in tries if "pretrained:" in r["policy"]), key=lambda row: row["request_share"])
+        curve = [row for row in tries if "pretrained:" in row["policy"]]
+        curve.sort(key=lambda row: float(row["policy"].partition("@")[2]))
         axes.plot(
             [row["request_share"] for row in curve],
             [rate_of(row) for row in curve],
@@ -236,7 +237,7 @@ def _share_axes(axes: Axes, ticks: Sequence[float]) -> None:
 
 
 def _finish(figure: Figure, panels: Sequence[Axes], path: Path) -> None:
-    panels[0].set_ylabel("flights with a collision (linear below 0.1 %)")
+    panels[0].set_ylabel("flights with a collision")
     handles = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
     figure.savefig(path)
