@@ -367,7 +367,7 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         kind = f"{where or owner.__name__} parameter" if isinstance(owner, type) else "argument"
         if isinstance(owner, type) and not parents and (deeper := _deeper(owner, name)):
             return ValueError(f"Unknown {kind} {shown(name)}: did you mean {' or '.join(deeper)}?")
-        return unknown_name(kind, name, _names(owner, parents))
+        return unknown_name(kind, name, [one for one in _names(owner, parents) if one != "self"])
     if "str" in place:  # in a union, each member reports an error under the name of its type
         place = place[: place.index("str")]
         errors = [each for each in errors if each["loc"][: len(place)] == place]
@@ -397,7 +397,7 @@ def _readable(message: str) -> str:
 def _names(owner: Any, path: Sequence[str] = ()) -> list[str]:
     """Return the names of a function's parameters, or of the fields of the dataclass at ``path`` in a dataclass."""
     if not dataclasses.is_dataclass(owner):
-        return [name for name in inspect.signature(owner).parameters if name != "self"]
+        return list(inspect.signature(owner).parameters)
     for name in path:
         if not name.isdigit():  # an entry of a list
             owner = _dataclass_in(get_type_hints(owner)[name])
