@@ -95,15 +95,15 @@ def braking_room(config: SwarmConfig, fence: float) -> np.ndarray:
     return fence + config.radius + np.array([sideways, sideways, 0.5])
 
 
-def _check_heights_and_distances(config: SwarmConfig, limits: SafetyLimits) -> None:
-    lowest, planner = config.planner.workspace_low[2], config.planner
+def _check_heights_and_distances(kind: SwarmConfig, config: SwarmConfig, limits: SafetyLimits) -> None:
+    lowest, planner = kind.planner.workspace_low[2], config.planner
     deepest, highest = min(lowest, 0.0) - _DEEPEST, max(lowest, _GROUND)
     if not deepest <= limits.ground <= highest:
         raise ValueError(
             f"limits.ground={limits.ground:g} m: a robot that lands stops its motors there; with "
             f"planner.workspace_low[2]={lowest:g}, it must be {deepest:g} to {highest:g} m"
         )
-    contact = 2 * config.radius - config.collision_tolerance
+    contact = 2 * config.radius - config.collision_tolerance  # of all pairs, whatever their radii, see `SwarmConfig`
     if limits.separation is not None and not contact <= limits.separation <= planner.separation:
         raise ValueError(
             f"limits.separation={limits.separation:g} m: robots hold their places below it, so it must be at least "
@@ -148,7 +148,7 @@ class Supervisor:
 
     def __init__(self, config: SwarmConfig, limits: SafetyLimits, robot: int = 0):
         kind = config.kinds[config.kind_of[robot]]
-        _check_heights_and_distances(kind, limits)
+        _check_heights_and_distances(kind, config, limits)
         _check_room(kind, limits)
         fastest = kind.planner.descent_rate
         if (slower := limits.landing / -fastest) > 1:

@@ -214,6 +214,12 @@ def test_limits_that_do_not_fit_the_world_are_refused(limits, message):
         Supervisor(CONFIG, SafetyLimits(**limits))
 
 
+def test_limits_of_unlike_robots_count_as_if_all_had_the_world_s_radius():
+    config = make_config("flight", n_robots=3, vehicles=({"radius": 0.2}, {"radius": 0.4}, {}))
+    for robot in range(3):
+        Supervisor(config, SafetyLimits(separation=0.7), robot)
+
+
 @pytest.mark.parametrize("limits", [{"fence": 300.0}, {"stale": 200.0, "lost": 1000.0}, {"hung": 300.0}])
 def test_limits_in_other_units_are_refused(limits):
     with pytest.raises(ValueError, match="less than or equal to"):
