@@ -17,8 +17,10 @@ packaged model, which was trained in version 2 and with obstacles; set 708 ``see
 model among obstacles with the braking reserve; set 710 ``five_eight``, ``five_among_eight``, ``five_four``,
 ``five_twelve`` and ``five_sixteen``, the flights that the other seeds need to have 12,000 of eight robots and 4,000 of
 other numbers with the packaged model, ``rule_again`` and ``none_again``, the best rule and no communication, and
-``own_crazyflie`` and ``own_hummingbird``, the packaged model in the foreign simulators. All parts before set 706 fly
-with equal penalties, those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and
+``own_crazyflie`` and ``own_hummingbird``, the packaged model in the foreign simulators; set 713 ``reserve_four``,
+``reserve_eight``, ``reserve_twelve`` and ``reserve_sixteen``, the flights that full communication needs to have 12,000
+of each scenario with obstacles and each number of robots. All parts before set 706 fly with equal penalties, those
+before set 709 without the reserve, as they did. JSON: one row per policy, scenario and
 number of robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
 """
 
@@ -44,6 +46,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
+RESERVE = 713
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -140,6 +143,10 @@ PARTS = {
     "five_four": Part(OTHER_SEEDS, EVERYWHERE, (4,), 500, FIVE),
     "five_twelve": Part(OTHER_SEEDS, EVERYWHERE, (12,), 500, FIVE),
     "five_sixteen": Part(OTHER_SEEDS, EVERYWHERE, (16,), 500, FIVE),
+    "reserve_four": Part(("full",), tuple(MOST_OBSTACLES), (4,), 8000, RESERVE),
+    "reserve_eight": Part(("full",), tuple(MOST_OBSTACLES), (8,), 8000, RESERVE),
+    "reserve_twelve": Part(("full",), tuple(MOST_OBSTACLES), (12,), 10000, RESERVE),
+    "reserve_sixteen": Part(("full",), tuple(MOST_OBSTACLES), (16,), 10000, RESERVE),
 }
 
 

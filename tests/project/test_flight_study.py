@@ -40,8 +40,9 @@ def test_sets_of_episodes_are_apart():
         version2.SEEDS,
         version2.BRAKING,
         version2.FIVE,
+        version2.RESERVE,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 18
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 19
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
