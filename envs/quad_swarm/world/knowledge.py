@@ -197,7 +197,9 @@ def _among(
     n = count // n_swarms
     start = np.zeros((n_swarms, n)) if late is None else planner.dt * late
     times = start[..., None] + planner.dt * np.arange(1.0, planner.horizon + 1)
-    expected = obstacles.ahead(times).reshape(count, k, planner.horizon, 3)
+    bodies_ahead = np.empty((n_swarms, n, m + k, planner.horizon, 3))
+    bodies_ahead[:, :, :m] = problems.others.reshape(n_swarms, n, m, planner.horizon, 3)
+    obstacles.ahead(times, out=bodies_ahead[:, :, m:])
     shape, size = np.ones((n_swarms, n, m + k, 3)), np.zeros((n_swarms, n, m + k))
     shape[..., :m, 2] = 1 / planner.downwash
     shape[..., m:, :] = obstacles.factors[:, None]
@@ -215,7 +217,7 @@ def _among(
         of_robots = np.ones((count, m)) if penalty is None else penalty
         penalty = np.concatenate([of_robots, np.full((count, k), planner.obstacle_penalty)], axis=1)
     return problems._replace(
-        others=np.concatenate([problems.others, expected], axis=1),
+        others=bodies_ahead.reshape(count, m + k, planner.horizon, 3),
         announced=announced,
         shape=shape.reshape(count, m + k, 3),
         size=size.reshape(count, m + k),

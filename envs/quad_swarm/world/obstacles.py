@@ -211,14 +211,16 @@ class Obstacles:
             for position, velocity, radius, factors in arrays
         )
 
-    def ahead(self, times: np.ndarray) -> np.ndarray:
+    def ahead(self, times: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """Return where robots expect the obstacles.
 
         :param times: times from now, (E, n, N) (s)
+        :param out: array to fill and return
         :return: centres, (E, n, K, N, 3), world frame (m)
         """
-        position, velocity = self.position[:, None, :, None], self.velocity[:, None, :, None]
-        return position + times[:, :, None, :, None] * velocity
+        moved = np.multiply(times[:, :, None, :, None], self.velocity[:, None, :, None], out=out)
+        moved += self.position[:, None, :, None]
+        return moved
 
     def advance(self, time: float) -> None:
         """Let time pass (s)."""

@@ -132,39 +132,27 @@ class CausalChannel(RadioChannel):
     """
 
     def __init__(self, round_trip: int, jitter: int, plans: np.ndarray, n_slots: int):
-        super().__init__(0, 0, plans)
+        # The plans on their way are among those of the last steps
+        super().__init__(0, round_trip + jitter, plans)
         self._round_trip = round_trip
-        shape = (round_trip + jitter, *plans.shape[:2], n_slots)
-        # By the number of steps until they are used, from 1: the plans on their way, from the current step on, and the
-        # steps since they were made, 0 where nothing is on its way
-        self._plans = np.zeros((*shape, *plans.shape[2:]))
-        self._ages = np.zeros(shape, dtype=np.int64)
+        # Steps since the plans on their way were made, by the number of steps until they are used, from 1; 0 where
+        # nothing is on its way
+        self._ages = np.zeros((round_trip + jitter, *plans.shape[:2], n_slots), dtype=np.int64)
 
     def deliver(
         self, arriving: np.ndarray, others: np.ndarray, lateness: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | int]:
-        fresh, age = self.answers(arriving, others)
         if not len(self._ages):
-            return arriving, fresh, age
-        where = np.nonzero(arriving)
-        late = self._round_trip + (0 if lateness is None else lateness[where])
-        late = np.broadcast_to(late, len(fresh))
-        used, used_ages = self._pass()
-        at_once = late == 0
-        rows = tuple(index[at_once] for index in where)
-        used[rows], used_ages[rows] = fresh[at_once], age  # newer than what arrives from earlier steps
-        rows = (late[~at_once] - 1, *(index[~at_once] for index in where))
-        self._plans[rows], self._ages[rows] = fresh[~at_once], age
-        received = used_ages > 0
-        return received, used[received], used_ages[received]
-
-    def _pass(self) -> tuple[np.ndarray, np.ndarray]:
-        """Begin a step: return the plans that are used in it, and their ages, 0 for none; the others come closer."""
-        plans, ages = self._plans[0], self._ages[0]
-        last = np.zeros_like(plans), np.zeros_like(ages)
-        self._plans = np.concatenate([advance(self._plans[1:]), last[0][None]])
-        self._ages = np.concatenate([np.where(self._ages[1:] > 0, self._ages[1:] + 1, 0), last[1][None]])
-        return advance(plans), np.where(ages > 0, ages + 1, 0)
+            return (arriving, *self.answers(arriving, others))
+        _, age = self.newest
+        late = self._round_trip if lateness is None else self._round_trip + lateness
+        ages = np.concatenate([self._ages + (self._ages > 0), np.zeros_like(self._ages[:1])])
+        for steps in range(len(ages)):
+            ages[steps][arriving & (late == steps)] = age  # newer than what arrives then from earlier steps
+        used, self._ages = ages[0], ages[1:]
+        swarms, robots, slots = received = np.nonzero(used)
+        senders = others[robots, slots] if others.ndim == 2 else others[received]
+        return used > 0, np.stack(self._available)[-used[received], swarms, senders], used[received]
 
     def forget(self, slots: np.ndarray) -> None:
         self._ages[:, slots] = 0
@@ -175,14 +163,15 @@ class CausalChannel(RadioChannel):
 
     def keep(self, swarms: np.ndarray) -> None:
         super().keep(swarms)
-        self._plans, self._ages = self._plans[:, swarms], self._ages[:, swarms]
+        self._ages = self._ages[:, swarms]
 
     def state_dict(self) -> list[np.ndarray]:
-        return [self._plans.copy(), self._ages.copy()]
+        return [*super().state_dict(), self._ages.copy()]
 
     def load_state_dict(self, state: Sequence[Any]) -> None:
-        if len(state) != 2:
-            raise ValueError(f"The state has {len(state)} arrays of plans on their way, but this world has 2.")
-        self._plans = like(self._plans, state[0], "plans on their way")
-        self._ages = like(self._ages, state[1], "ages of plans on their way", 0)
-        self._available = []
+        *earlier, ages = state
+        super().load_state_dict(earlier)
+        ages, most = like(self._ages, ages, "ages of plans on their way", 0), len(self._ages)
+        if (ages.max(axis=(1, 2, 3), initial=0) > np.arange(most, 0, -1)).any():
+            raise ValueError(f"The state has plans on their way for more than the {most} steps of this world.")
+        self._ages = ages

@@ -127,5 +127,9 @@ def test_what_is_on_its_way_is_part_of_the_state_and_ends_with_the_episode():
     assert found[0][0].all()
     assert all(np.array_equal(a, b) for a, b in zip(found[0], found[1], strict=True))
     assert np.array_equal(found[2][0], np.array([[[False] * 2] * 3, [[True] * 2, [True] * 2, [False, True]]]))
-    with pytest.raises(ValueError, match="plans on their way"):
+    with pytest.raises(ValueError, match="The state has 2 earlier plans, but this world has 3"):
         causal(round_trip=3).load_state_dict(radio.state_dict())
+    *plans, ages = causal(round_trip=2).state_dict()
+    ages[1] = 2  # used in two steps, when it would be four steps old
+    with pytest.raises(ValueError, match="on their way for more than the 2 steps"):
+        radio.load_state_dict([*plans, ages])
