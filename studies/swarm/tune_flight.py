@@ -1,8 +1,9 @@
 """Tune rules and models in `flight` with one setting for all scenarios and numbers of robots, on the validation set.
 
-``python -m studies.swarm.tune_flight rules|thresholds [MODEL.zip ...] [--up-to 12] [--quick] [--json F]``. A setting,
-which is a rule or a threshold of a model, is safe if it is as safe as full communication up to a margin in each cell,
-which is a scenario with a number of robots (`AIMS`).
+``python -m studies.swarm.tune_flight rules|thresholds [MODEL.zip ...] [--preset flight] [--up-to 12] [--quick]
+[--json F]``. A setting, which is a rule or a threshold of a model, is safe if it is as safe as full communication up to
+a margin in each cell, which is a scenario with a number of robots (`AIMS`). ``--preset flight-v2`` tunes rules for up
+to sixteen robots in version 2 (`VERSION_2`).
 
 All rules first fly a few episodes of both swaps with eight robots to measure their requests. Of rules with identical
 flights, only one is kept. The rules are then tried by increasing number of requests, in stages of more and more
@@ -22,6 +23,7 @@ import itertools
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,6 +40,9 @@ Cell = tuple[int, str]  # number of robots, scenario
 Flown = dict[Cell, Rows]
 
 
+PRESET = "flight"
+
+
 class Setting(NamedTuple):
     """A rule with its family, or a model with a threshold, whose family is the model."""
 
@@ -45,7 +50,6 @@ class Setting(NamedTuple):
     name: str
 
 
-PRESET = "flight"
 SWAPS = ("symmetric_swap", "asymmetric_swap")
 OWN_SWAPS: list[Cell] = [(8, name) for name in SWAPS]
 STAGES = (25, 50, 100, 250, 500, 1000, 2000, 4000)
@@ -63,12 +67,16 @@ class Aim(NamedTuple):
     :param margin: limit for the upper bound of the difference to full communication
     :param thresholds: thresholds of models to try in this order
     :param price: if given, models are not tuned to be safe, but to make at most this share of the best rule's requests
+    :param preset: the world
+    :param full_collides: whether full communication has to be flown, or is known not to collide
     """
 
     sizes: dict[int, int]
     margin: float
     thresholds: tuple[float, ...]
     price: float | None = None
+    preset: str = PRESET
+    full_collides: bool = True
 
     @property
     def cells(self) -> list[Cell]:
@@ -89,15 +97,21 @@ AIMS = {
     16: Aim({16: 4000, 12: 4000, 8: 4000, 4: 4000}, 0.002, (0.02, *(round(0.05 * k, 2) for k in range(1, 17))), 0.45),
 }
 FILES = {12: "flight_tuning.json.gz", 16: "flight_sixteen.json.gz"}
+# Without obstacles, full communication collides in none of 198,000 sealed flights of version 2. 1,300 episodes without
+# a collision are the fewest that are within the margin.
+VERSION_2 = Aim(dict.fromkeys((16, 12, 8, 4), 1300), SAFETY_MARGIN, (), preset="flight-v2", full_collides=False)
+VERSION_2_FILE = "flight_v2_tuning.json.gz"
 UP_TO = 12  # robots of the largest team by default
+TELL_FROM = (0.1, 0.2, 0.3, 0.4, 0.5)  # deviations from the presumed plan (separations)
 PRICED_ON = 100  # episodes of each swap in which the requests of a threshold are measured
 
 
-def families(up_to: int = UP_TO) -> dict[str, list[str]]:
+def families(up_to: int = UP_TO, commitment: bool = False) -> dict[str, list[str]]:
     """Return the rules of each family, with lengths in separations.
 
     :param up_to: number of robots of the largest team; with more than twelve, there are also rules that ask for most of
         the plans
+    :param commitment: whether robots keep to the plans that they sent, for which there are rules that tell
     """
     product = itertools.product
     cpas = [f"cpa:{d}s:{t}" for d, t in product((1.0, 1.05, 1.1, 1.15, 1.2, 1.3), (1, 1.5, 2, 3))]
@@ -107,33 +121,40 @@ def families(up_to: int = UP_TO) -> dict[str, list[str]]:
         "distance": [f"distance:{d}s" for d in (2, 2.5, 3, 3.5, 4, 5, 6, 8)],
         "wide": [f"cpa:{d}s:{t}" for d, t in product((2, 2.5, 3), (2, 3))] + [f"plan:{d}s" for d in (1.8, 2, 2.5, 3)],
     }
-    return (generous if up_to > UP_TO else {}) | {
-        "cpa": [f"cpa:{d}s:{t}" for d, t in product((1.0, 1.04, 1.08, 1.12, 1.18, 1.25, 1.35, 1.5), (1, 1.5, 2, 3))],
-        "plan and stale": [f"{plan}&stale:{k}" for plan, k in product(plans, range(1, 9))],
-        "plan, soon and stale": [
-            f"{plan}&soon:{t}&stale:{k}" for plan, t, k in product(plans[2:9:2], (0.5, 0.8, 1.2), (2, 3, 4, 6))
-        ],
-        "cpa and stale": [f"{cpa}&stale:{k}" for cpa, k in product(cpas, (2, 3, 4, 6, 8))],
-        "cpa and event": [f"{cpa}&event:{e}" for cpa, e in product(far, (0.02, 0.03, 0.05, 0.1))],
-        "push": [f"push:{e}" for e in (0.1, 0.15, 0.2, 0.3, 0.4)],
-        "cpa, soon or stale": [
-            f"{cpa}&soon:{t}|{cpa}&stale:{k}" for cpa, t, k in product(far, (0.2, 0.3, 0.5), (3, 4, 6))
-        ],
-        "plan, soon or stale": [
-            f"{plan}&soon:{t}|{plan}&stale:{k}" for plan, t, k in product(plans[2:9:2], (0.2, 0.3, 0.5), (3, 4, 6))
-        ],
-        "plan or cpa, stale": [
-            f"{plan}&stale:{k}|cpa:{c}&stale:{k}"
-            for plan, c, k in product(plans[3::2], ("1.05s:1.5", "1.1s:2", "1.2s:2"), (2, 3, 4))
-        ],
-    }
+    telling = {"stage": [f"stage:{d}:{e}" for d, e in product((0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2), TELL_FROM)]}
+    return (
+        (generous if up_to > UP_TO else {})
+        | (telling if commitment else {})
+        | {
+            "cpa": [
+                f"cpa:{d}s:{t}" for d, t in product((1.0, 1.04, 1.08, 1.12, 1.18, 1.25, 1.35, 1.5), (1, 1.5, 2, 3))
+            ],
+            "plan and stale": [f"{plan}&stale:{k}" for plan, k in product(plans, range(1, 9))],
+            "plan, soon and stale": [
+                f"{plan}&soon:{t}&stale:{k}" for plan, t, k in product(plans[2:9:2], (0.5, 0.8, 1.2), (2, 3, 4, 6))
+            ],
+            "cpa and stale": [f"{cpa}&stale:{k}" for cpa, k in product(cpas, (2, 3, 4, 6, 8))],
+            "cpa and event": [f"{cpa}&event:{e}" for cpa, e in product(far, (0.02, 0.03, 0.05, 0.1))],
+            "push": [f"push:{e}" for e in (0.1, 0.15, 0.2, 0.3, 0.4)],
+            "cpa, soon or stale": [
+                f"{cpa}&soon:{t}|{cpa}&stale:{k}" for cpa, t, k in product(far, (0.2, 0.3, 0.5), (3, 4, 6))
+            ],
+            "plan, soon or stale": [
+                f"{plan}&soon:{t}|{plan}&stale:{k}" for plan, t, k in product(plans[2:9:2], (0.2, 0.3, 0.5), (3, 4, 6))
+            ],
+            "plan or cpa, stale": [
+                f"{plan}&stale:{k}|cpa:{c}&stale:{k}"
+                for plan, c, k in product(plans[3::2], ("1.05s:1.5", "1.1s:2", "1.2s:2"), (2, 3, 4))
+            ],
+        }
+    )
 
 
-def fly(policy: str, cell: Cell, episodes: int, known: Rows | None = None) -> Rows:
+def fly(policy: str, cell: Cell, episodes: int, known: Rows | None = None, preset: str = PRESET) -> Rows:
     """Return a policy's statistics in the first episodes, some of which may be known."""
     rows, (n_robots, name) = list(known or []), cell
     if episodes > len(rows):
-        rows += fly_validation([policy], PRESET, name, episodes, n_robots, skip=len(rows))[policy]
+        rows += fly_validation([policy], preset, name, episodes, n_robots, skip=len(rows))[policy]
     return rows
 
 
@@ -169,7 +190,7 @@ def try_out(policy: str, full: Flown, stages: Sequence[int], hard: Sequence[int]
     cell = aim.cells[0]
     if hard:
         first_one = first_episode(VALIDATION)
-        one = condition(policy, cell[1], world(PRESET, cell[0]))
+        one = condition(policy, cell[1], world(aim.preset, cell[0]))
         rows: Rows = []
         collided: set[int] = set()
         for begin in range(0, len(hard), AT_ONCE):
@@ -192,7 +213,7 @@ def _by_stages(policy: str, full: Flown, stages: Sequence[int], aim: Aim) -> tup
     order = [(stage, cell) for cell in cells for stage in first[cell]]
     order += [(stage, cell) for stage in stages for cell in cells if stage not in first[cell]]
     for stage, cell in order:
-        flown[cell] = fly(policy, cell, min(stage, last(aim, cell, stages)), flown.get(cell))
+        flown[cell] = fly(policy, cell, min(stage, last(aim, cell, stages)), flown.get(cell), aim.preset)
         if not may_be_safe(flown[cell], full[cell], aim.sizes[cell[0]], aim.margin):
             return flown, False
     return flown, True
@@ -210,12 +231,14 @@ def may_be_safe(flown: Rows, full: Rows, deciding: int, margin: float) -> bool:
     return Comparison.of([*flown, *no_more][:deciding], [*full, *no_more][:deciding]).as_safe(margin)
 
 
-def rows_of(family: str, setting: str, flown: Flown, safe: bool | None, selected: bool = False) -> list[Row]:
+def rows_of(
+    family: str, setting: str, flown: Flown, safe: bool | None, selected: bool = False, preset: str = PRESET
+) -> list[Row]:
     """Return the rows of a setting."""
-    keys: Row = {"preset": PRESET, "family": family, "setting": setting, "safe": safe}
+    keys: Row = {"preset": preset, "family": family, "setting": setting, "safe": safe}
     keys |= {"selected": True} if selected else {}
     return [
-        keys | {"n_robots": n_robots, "scenario": name} | summarise(rows, world(PRESET, n_robots))
+        keys | {"n_robots": n_robots, "scenario": name} | summarise(rows, world(preset, n_robots))
         for (n_robots, name), rows in flown.items()
         if rows
     ]
@@ -228,6 +251,8 @@ def table_of(path: Path) -> Experiment:
 
 def fly_full(pool: Executor, table: Experiment, stages: Sequence[int], aim: Aim = AIMS[12]) -> Flown:
     """Return the collisions with full communication in all episodes for a decision. Known results are reused."""
+    if not aim.full_collides:
+        return {cell: [{"collided": False}] * last(aim, cell, stages) for cell in aim.cells}
     known = {cell_of(row): row["outcomes"] for row in table.rows() if row["family"] == FULL}
     missing = [cell for cell in aim.cells if len(known.get(cell, "")) < last(aim, cell, stages)]
     work = pool.map(fly, [FULL] * len(missing), missing, [last(aim, cell, stages) for cell in missing])
@@ -239,22 +264,22 @@ def fly_full(pool: Executor, table: Experiment, stages: Sequence[int], aim: Aim 
 
 
 def by_requests(
-    pool: Executor, table: Experiment, stages: Sequence[int], quick: bool, up_to: int = UP_TO
+    pool: Executor, table: Experiment, stages: Sequence[int], quick: bool, up_to: int = UP_TO, preset: str = PRESET
 ) -> list[Setting]:
     """Return the rules by increasing number of requests in both swaps of eight robots, without rules with identical
     flights."""
-    rules = [
-        Setting(family, rule) for family, rules in families(up_to).items() for rule in rules[:: 12 if quick else 1]
-    ]
+    known_families = families(up_to, commitment=preset == VERSION_2.preset)
+    rules = [Setting(family, rule) for family, rules in known_families.items() for rule in rules[:: 12 if quick else 1]]
     known: dict[str, list[Row]] = {}
     for row in table.rows():
         if cell_of(row) in OWN_SWAPS:
             known.setdefault(row["setting"], []).append(row)
     work = [(rule, cell) for rule in rules if len(known.get(rule.name, [])) < len(OWN_SWAPS) for cell in OWN_SWAPS]
-    flown = pool.map(fly, [rule.name for rule, _ in work], [cell for _, cell in work], [stages[0]] * len(work))
+    first = partial(fly, episodes=stages[0], preset=preset)
+    flown = pool.map(first, [rule.name for rule, _ in work], [cell for _, cell in work])
     lines = []
     for (rule, cell), rows in zip(work, progress(flown, "requests", len(work)), strict=True):
-        lines += rows_of(*rule, {cell: rows}, None)
+        lines += rows_of(*rule, {cell: rows}, None, preset=preset)
         known.setdefault(rule.name, []).append(lines[-1])
     table.keep(lines, "preset", "setting")
     rules.sort(key=lambda rule: sum(row["request_share"] for row in known[rule.name]))
@@ -370,7 +395,7 @@ def tune(
             trial = done.result()
             decided[setting.name] = trial.safe
             collisions.update(trial.collided)
-            rows = rows_of(*setting, trial.flown, trial.safe, trial.selected)
+            rows = rows_of(*setting, trial.flown, trial.safe, trial.selected, aim.preset)
             for row in rows:
                 row |= {"collided": trial.collided} if cell_of(row) == hardest else {}
             table.keep(rows)
@@ -395,12 +420,21 @@ def main() -> None:
     parser = command_line(__doc__, "fly few episodes")
     parser.add_argument("what", choices=("rules", "thresholds"))
     parser.add_argument("models", nargs="*", metavar="MODEL.zip")
+    parser.add_argument("--preset", choices=(PRESET, VERSION_2.preset), default=PRESET, help="the world")
     parser.add_argument("--up-to", type=int, choices=AIMS, default=UP_TO, help="number of robots of the largest team")
     parser.add_argument(
-        "--json", type=absolute_path, metavar="FILE", help=f"default: {', '.join(FILES.values())} in {DATA}"
+        "--json",
+        type=absolute_path,
+        metavar="FILE",
+        help=f"default: {', '.join((*FILES.values(), VERSION_2_FILE))} in {DATA}",
     )
     args = parser.parse_args()
-    aim, table = AIMS[args.up_to], table_of(args.json or DATA / FILES[args.up_to])
+    aim, name = AIMS[args.up_to], FILES[args.up_to]
+    if args.preset == VERSION_2.preset:
+        if args.what != "rules":
+            parser.error("thresholds of version 2 are chosen on other sets: only rules are tuned in it")
+        aim, name = VERSION_2, VERSION_2_FILE
+    table = table_of(args.json or DATA / name)
     if args.what == "thresholds" and not args.models:
         parser.error("pass the models whose thresholds should be tuned")
     stages = QUICK_STAGES if args.quick else STAGES
@@ -411,7 +445,7 @@ def main() -> None:
             at_the_price_of(rule, pool, table, args.models, aim, stages[0] if args.quick else PRICED_ON)
             return
         if args.what == "rules":
-            ladders = [by_requests(pool, table, stages, args.quick, args.up_to)]
+            ladders = [by_requests(pool, table, stages, args.quick, max(aim.sizes), aim.preset)]
         else:
             ladders = [[Setting(model, f"{model}@{t:g}") for t in aim.thresholds] for model in args.models]
         tune(pool, args.jobs, ladders, full, stages, table, aim)

@@ -69,9 +69,9 @@ def test_the_table_at_a_glance_says_what_it_costs():
     assert cells[-1][0] == "**learned**, 2 training seeds together"
 
 
-@pytest.mark.parametrize("family", tune_flight.families(16))
+@pytest.mark.parametrize("family", tune_flight.families(16, commitment=True))
 def test_every_rule_can_be_read(family):
-    rules = tune_flight.families(16)[family]
+    rules = tune_flight.families(16, commitment=True)[family]
     assert len(set(rules)) == len(rules) > 3
     for rule in rules:
         parse_rule(rule)
@@ -163,7 +163,7 @@ def settings(path: Path) -> dict[str, bool | None]:
 
 def test_rules_are_tried_from_the_cheapest_on_until_one_is_safe(flown, monkeypatch, tmp_path):
     families = {"one": ["good 0.4", "bad 0.1", "good 0.3"], "two": ["bad 0.35", "good 0.2"]}
-    monkeypatch.setattr(tune_flight, "families", lambda up_to: families)
+    monkeypatch.setattr(tune_flight, "families", lambda up_to, commitment: families)
     path, stages = tmp_path / "tuning.json", tune_flight.STAGES
     table = tune_flight.table_of(path)
     rules = tune_flight.by_requests(Inline(), table, stages, quick=False)
