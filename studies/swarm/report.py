@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from quad_swarm.evaluation.flight import Flight
-from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
+from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison, newcombe_interval
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.plants.base import MODEL
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import PRESETS
+from quad_swarm.world.scenarios import MOST_OBSTACLES
 from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import absolute_path
 from studies.swarm.figures import (
@@ -40,6 +41,7 @@ from studies.swarm.figures import (
 from studies.swarm.fly import PAPERS
 from studies.swarm.protocol import DATA, OF_TEAM, ROOT, best_rules, models
 from studies.swarm.tune_flight import FULL, SWAPS, best_rule
+from studies.swarm.version2 import BRAKING, OWN_MODEL, named
 
 APPENDICES = ("swarm_tables", "flight_tables", "teams", "robustness", "asking")
 RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
@@ -510,23 +512,33 @@ def headline_table(rows: Rows, best: str) -> str:
     return table([*head, "plans sent, of all possible, all scenarios", "bytes/s a robot sends, all scenarios"], lines)
 
 
-def glance_table(rows: Rows, orca: Rows) -> str:
-    """Format the symmetric swap of eight robots in the sealed flights of `flight-v2`: what it is worth, what it costs.
+def of_version_2(rows: Rows, orca: Rows, n_robots: int, page: str) -> dict[str, Rows]:
+    """Group the sealed flights of the symmetric swap in `flight-v2` by who sends plans.
 
     :param rows: rows of `studies.swarm.version2`; those of several sets are counted together
     :param orca: rows of ORCA in several presets
+    :param n_robots: number of robots
+    :param page: address of the planner's page
     """
-    here = [row for row in rows if hardest(row, 8) and row["plant"] == MODEL]
+    here = [row for row in rows if hardest(row, n_robots) and row["plant"] == MODEL]
     learned = [row for row in here if "flight-v2" in row["policy"] or "flight_v2_seed" in row["policy"]]
+    seeds = len({row["policy"] for row in learned})
     groups = {
         "nobody tells anybody": [row for row in here if row["policy"] == "none"],
         "everybody tells everybody": [row for row in here if row["policy"] == FULL],
-        "[ORCA](docs/planner.md#without-messages-orca-and-voronoi-cells)": [
-            row for row in orca if hardest(row, 8) and row["preset"] == "flight-v2"
+        f"[ORCA]({page}#without-messages-orca-and-voronoi-cells)": [
+            row for row in orca if hardest(row, n_robots) and row["preset"] == "flight-v2"
         ],
         f"best of {RULES_TRIED} rules, found in version 1": [row for row in here if row["policy"] == BEST_RULE],
-        f"**learned**, {len({row['policy'] for row in learned})} training seeds together": learned,
+        "**learned**" + (f", {seeds} training seeds together" if seeds > 1 else ""): learned,
     }
+    return {what: chosen for what, chosen in groups.items() if chosen}
+
+
+def glance_table(rows: Rows, orca: Rows) -> str:
+    """Format the symmetric swap of eight robots in the sealed flights of `flight-v2`: what it is worth, what it costs.
+    See `of_version_2`."""
+    groups = of_version_2(rows, orca, 8, "docs/planner.md")
     full = merged(groups["everybody tells everybody"])["steps_to_arrival"]
     lines = []
     for what, chosen in groups.items():
@@ -539,6 +551,54 @@ def glance_table(rows: Rows, orca: Rows) -> str:
             later = f"{full * PRESETS['flight-v2'].planner.dt:.1f} s"
         lines.append([what, seeds_rate([together]), spread([f"{share:.1%}" for share in sent]), later])
     return table(["", "flights with a collision", "plans sent", "arrival, beside full"], lines)
+
+
+def version_2_table(rows: Rows, orca: Rows) -> str:
+    """Format the symmetric swap of eight and sixteen robots in the sealed flights of `flight-v2`, with the sets that
+    are counted. See `of_version_2`."""
+    lines = []
+    for n in (8, 16):
+        for what, chosen in of_version_2(rows, orca, n, "planner.md").items():
+            each = by_policy(chosen)
+            times = sorted(float(one["steps_to_arrival"]) for one in each if one["steps_to_arrival"])
+            lines.append(
+                [
+                    str(n),
+                    what,
+                    seeds_rate([merged(chosen)]).replace("<br>", "&nbsp;"),
+                    f"{min(row['min_separation_quantiles']['0.01'] for row in chosen):.2f}",
+                    spread([f"{share:.1%}" for share in sorted(one["request_share"] for one in each)]),
+                    spread([f"{time:.0f}" for time in times]),
+                    ", ".join(map(str, sorted({row.get("set") or row["seed"] for row in chosen}))),
+                ]
+            )
+    return table(["robots", "who sends", "collided", "near (m)", "plans sent", "steps", "sets"], lines)
+
+
+def cells_table(rows: Rows) -> str:
+    """Format the flights of the packaged model of `flight-v2` by scenario and number of robots.
+
+    :param rows: rows of `studies.swarm.version2`. Flights among obstacles count from the braking reserve on
+    """
+    flown = [row for row in rows if row["plant"] == MODEL and (row["scenario"] in NAMES or row["set"] >= BRAKING)]
+    cells: dict[tuple[str, int], dict[str, Rows]] = {}
+    for row in flown:
+        here = cells.setdefault((row["scenario"], row["n_robots"]), {})
+        here.setdefault(row["policy"], []).append(row)
+    sizes = sorted({n for _, n in cells})
+    lines = []
+    for name in (*NAMES, *MOST_OBSTACLES):
+        line, everybody = [name.replace("_", " ")], []
+        for n in sizes:
+            own, full = merged(cells[name, n][named(OWN_MODEL)]), merged(cells[name, n][FULL])
+            counts = [one[key] for one in (own, full) for key in ("collisions", "episodes")]
+            sign = "" if newcombe_interval(*counts)[1] < SAFETY_MARGIN else "**"
+            later = f"{own['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%")
+            line.append(f"{sign}{own['collisions']}{sign}; {own['request_share']:.1%}, {later}".replace(" ", "&nbsp;"))
+            everybody.append(full)
+        flights = sum(one["episodes"] for one in everybody)
+        lines.append([*line, f"{sum(one['collisions'] for one in everybody)} of {flights:,}".replace(" ", "&nbsp;")])
+    return table(["scenario", *(f"{n} robots" for n in sizes), "full, all of these"], lines)
 
 
 def seeds_rate(rows: Rows) -> str:
@@ -641,6 +701,7 @@ def main() -> None:
         for name in [*names.split(), "checkpoints", "flight", "flight_tuning", "flight_sixteen_sealed", "flight_world"]
     }
     rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))
+    sealed_2, orca, tried_2 = (read_rows(VERSION_2 / f"{name}.json") for name in ("version2", "orca", "front"))
     blocks = {
         "targets": targets(test),
         "worse": worse_table(test),
@@ -665,7 +726,9 @@ def main() -> None:
         "counterfactual": reference_table(rows["counterfactual"], "price"),
         "training": training_table(rows["training"]),
         "headline": headline_table(rows["flight"], best_rule()) if rows["flight"] else "Not flown yet.",
-        "glance": glance_table(*(read_rows(VERSION_2 / f"{name}.json") for name in ("version2", "orca"))),
+        "glance": glance_table(sealed_2, orca),
+        "version 2": version_2_table(sealed_2, orca),
+        "cells": cells_table(sealed_2),
         "flight": flight_table(rows["flight"]),
         "flight tuning": tuned_table(rows["flight_tuning"]),
         "flight targets": flight_targets(rows["flight"]),
@@ -697,7 +760,6 @@ def main() -> None:
         tried = [*rows["flight_tuning"], *read_rows(args.data / "flight_sixteen.json.gz")]
         sealed = rows["flight"], rows["flight_sixteen_sealed"]
         draw_flight_fronts(tried, *sealed, args.images / "front_flight.png")
-    sealed_2, orca, tried_2 = (read_rows(VERSION_2 / f"{name}.json") for name in ("version2", "orca", "front"))
     draw_version_2(sealed_2, orca, tried_2, args.images / "front_version_2.png")
     if flown:
         draw_trajectories(flown, args.images / "flights.png")

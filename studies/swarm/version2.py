@@ -174,11 +174,12 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
                 fly_piece = partial(delay_check.fly, checked, scenario, CLEARANCE)
                 flown[DELAY_CHECK] = [row for rows in executor.map(fly_piece, pieces) for row in rows]
             for policy, rows in flown.items():
-                keys = {"policy": _name(policy), "scenario": scenario, "n_robots": n, "plant": part.plant}
+                keys = {"policy": named(policy), "scenario": scenario, "n_robots": n, "plant": part.plant}
                 yield keys | {"vehicle": part.vehicle, "set": part.set} | summarise(rows, config)
 
 
-def _name(policy: str) -> str:
+def named(policy: str) -> str:
+    """Return how rows name a policy: packaged models by their names, others by their paths."""
     for model in ("quad-swarm-flight", "quad-swarm-flight-v2"):
         policy = policy.replace(str(pretrained_folder(model) / "model.zip"), f"pretrained:{model}")
     return policy

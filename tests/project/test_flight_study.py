@@ -69,6 +69,35 @@ def test_the_table_at_a_glance_says_what_it_costs():
     assert cells[-1][0] == "**learned**, 2 training seeds together"
 
 
+def test_the_tables_of_version_2_count_sets_together_and_judge_cells():
+    keys = {"plant": "model", "arrived": 1000, "steps_to_arrival": 70.0, "request_share": 1.0, "policy": "full"}
+    keys["min_separation_quantiles"] = {"0.01": 0.7}
+    own = keys | {"policy": version2.named(version2.OWN_MODEL), "episodes": 2000, "steps_to_arrival": 77.0}
+    own |= {"request_share": 0.02, "set": 707}
+    cells = [(name, n) for name in version2.EVERYWHERE for n in (8, 16)]
+    rows = [
+        one | {"scenario": name, "n_robots": n, "collisions": 0}
+        for name, n in cells
+        for one in (keys | {"episodes": 4000, "set": 703}, keys | {"episodes": 1000, "set": 709}, own)
+        if one["set"] >= version2.BRAKING or name in version2.without_obstacles() or one["policy"] != "full"
+    ]
+    rows += [row | {"set": 709, "collisions": 2} for row in rows if row["scenario"] == "forest" and row["set"] == 707]
+    rows += [
+        row | {"set": 709} for row in rows if row["set"] == 707 and row["scenario"] in ("doorway", "crossing_traffic")
+    ]
+    cells = report.cells_table(rows).replace("&nbsp;", " ").splitlines()
+    assert cells[2] == "| symmetric swap | 0; 2.0%, +10% | 0; 2.0%, +10% | 0 of 10,000 |"
+    assert (
+        next(line for line in cells if "forest" in line)
+        == "| forest | **2**; 2.0%, +10% | **2**; 2.0%, +10% | 0 of 2,000 |"
+    )
+    table = report.version_2_table(rows, []).replace("&nbsp;", " ").splitlines()
+    assert [line.split(" | ")[2:] for line in table[2:4]] == [
+        ["0 of 5,000 [0.00, 0.08] %", "0.70", "100.0%", "70", "703, 709 |"],
+        ["0 of 2,000 [0.00, 0.19] %", "0.70", "2.0%", "77", "707 |"],
+    ]
+
+
 @pytest.mark.parametrize("family", tune_flight.families(16, commitment=True))
 def test_every_rule_can_be_read(family):
     rules = tune_flight.families(16, commitment=True)[family]

@@ -19,6 +19,16 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return max(0.0, centre - half), min(1.0, centre + half)
 
 
+def newcombe_interval(successes: int, trials: int, others: int, other_trials: int) -> tuple[float, float]:
+    """Return the 95 % interval of the difference of two rates in different trials, the first minus the second, from
+    their Wilson intervals (Newcombe 1998, Statistics in Medicine 17, p. 873, method 10)."""
+    one, other = successes / trials, others / other_trials
+    low, high = wilson_interval(successes, trials)
+    other_low, other_high = wilson_interval(others, other_trials)
+    below, above = math.hypot(one - low, other_high - other), math.hypot(high - one, other - other_low)
+    return one - other - below, one - other + above
+
+
 class Comparison(NamedTuple):
     """Collisions of two policies over the same episodes.
 

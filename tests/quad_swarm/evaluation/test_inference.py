@@ -2,7 +2,7 @@
 
 import pytest
 
-from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison, wilson_interval
+from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison, newcombe_interval, wilson_interval
 
 
 @pytest.mark.parametrize(
@@ -35,3 +35,18 @@ def test_as_safe_has_a_margin():
     assert not Comparison(4000, 12, 1).as_safe()
     assert Comparison(4000, 12, 1).as_safe(0.005)
     assert not Comparison(100, 0, 0).as_safe(), "too few episodes"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "low", "high"),
+    [
+        # Newcombe, Statistics in Medicine 17 (1998), p. 873, table II, method 10.
+        ((56, 70), (48, 80), 0.0524, 0.3339),
+        ((9, 10), (3, 10), 0.1705, 0.8090),
+        ((5, 56), (0, 29), -0.0381, 0.1926),
+        ((0, 10), (0, 20), -0.1611, 0.2775),
+        ((10, 10), (0, 20), 0.6791, 1.0),
+    ],
+)
+def test_rates_in_different_trials_are_compared(first, second, low, high):
+    assert newcombe_interval(*first, *second) == pytest.approx((low, high), abs=5e-5)
