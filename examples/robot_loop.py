@@ -111,7 +111,9 @@ def fly(index, addresses, begins, duration, folder, rule, shared, team):
     config = robot.config
     if not 0 < (ahead := begins / 1e6 - time.time()) < 600:
         now = time.time_ns() // 1000
-        raise SystemExit(f"robot {index}: --begins {begins} is {ahead:.1f} s from now, {now} us; choose 1 to 600 s")
+        raise SystemExit(
+            f"robot {index}: --begins {begins} is {ahead:.1f} s from now, {now}: give microseconds, 1 to 600 s ahead"
+        )
     link = open_link(index, addresses, session_of(config, team))
     vehicle = MyVehicle(index, config, shared)
     # For your room: fence, braking and radius must fit between workspace and walls. Below the separation, here halfway

@@ -13,7 +13,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pydantic
@@ -376,6 +376,9 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
     if place and isinstance(place[0], int):  # a positional argument
         place = (_names(owner)[place[0]], *place[1:])
     problem = " or ".join(dict.fromkeys(_readable(each["msg"]) for each in errors))
+    if errors[0]["type"] == "tuple_type" and (entries := _entries(owner, place)):
+        problem = f"it must be a list of {entries}"
+        problem += f", as in {[value, value]}" if entries == 2 and type(value) in (int, float) else ""
     name = ".".join((*path, *(str(part) for part in place)))
     if errors[0]["type"] == "value_error" and not isinstance(value, (tuple, list)):
         return ValueError(
@@ -385,13 +388,16 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         if isinstance(place[-1], str):
             return ValueError(f"{name} is missing in {shown(value)}.")
         name, problem = name.rpartition(".")[0], "it has too few entries"
+        problem += f": it must have {entries}" if (entries := _entries(owner, place[:-1])) else ""
     return ValueError(f"{name}={shown(value)}: {problem}.")
 
 
 def _readable(message: str) -> str:
     message = message.removeprefix("Value error, ").replace("Input should", "it must", 1)
     message = message.replace("a valid tuple", "a list, [...]")
-    return message.replace("dictionary", "mapping").replace(" or an instance of", ", not a plain value, or a")
+    message = re.sub(r"Tuple should have (at \w+ \d+) items? after validation", r"it must have \1 entries", message)
+    message = message.replace("dictionary", "mapping").replace(" or an instance of ", ", not a plain value, or a ")
+    return re.sub(r"\ba (?=[AEIOU][a-z])", "an ", message)
 
 
 def _names(owner: Any, path: Sequence[str] = ()) -> list[str]:
@@ -402,6 +408,20 @@ def _names(owner: Any, path: Sequence[str] = ()) -> list[str]:
         if not name.isdigit():  # an entry of a list
             owner = _dataclass_in(get_type_hints(owner)[name])
     return [field.name for field in dataclasses.fields(owner)]
+
+
+def _entries(owner: Any, place: Sequence[Any]) -> int | None:
+    """Return how many entries a list has at ``place`` in a dataclass or in a function's arguments, None for any
+    number."""
+    annotation = owner
+    for part in place:
+        if isinstance(part, str):
+            within = annotation if annotation is owner else _dataclass_in(annotation)
+            annotation = get_type_hints(within).get(part) if within is not None else None
+    for one in (annotation, *get_args(annotation)):
+        if get_origin(one) is tuple and Ellipsis not in get_args(one):
+            return len(get_args(one))
+    return None
 
 
 def _deeper(owner: Any, name: str) -> list[str]:

@@ -11,6 +11,7 @@ import shutil
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from quad_swarm.errors import needs_extra, shown
 from quad_swarm.evaluation.command import preset_of
@@ -18,7 +19,7 @@ from quad_swarm.evaluation.policies import OBSERVATION_ARGUMENTS, fitted, is_mod
 from quad_swarm.parsing import Parser
 from quad_swarm.robot import files
 from quad_swarm.validation import read_assignments
-from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
+from quad_swarm.world.presets import PRESETS, SwarmConfig, first_difference, make_config
 
 EXAMPLES = "  sb3-maddpg export pretrained:quad-swarm-flight --n-robots 8 --out robots"
 
@@ -34,8 +35,12 @@ def export(model: str, config: SwarmConfig, folder: Path, algo: str = "sb3_maddp
     :raises ValueError: if the model does not fit the world, robots cannot fly by themselves in it, the folder holds
         an export for another world, or the extra ``onnx`` is not installed
     """
-    if _holds_another_world(folder, config):
-        raise ValueError(f"{folder} holds an export for another world: choose another folder, or remove it.")
+    if (other := _other_world(folder, config)) is not None:
+        name, there, here = other
+        raise ValueError(
+            f"{folder} holds an export for another world, with {name}={shown(there)} instead of {shown(here)}: choose "
+            "another folder, or remove it."
+        )
     if config.is_limited:
         raise ValueError("neighbourhood: a robot of its own perceives all others; leave it out.")
     loaded = load_model(model, algo)
@@ -68,11 +73,11 @@ def export(model: str, config: SwarmConfig, folder: Path, algo: str = "sb3_maddp
     return files.load(folder)
 
 
-def _holds_another_world(folder: Path, config: SwarmConfig) -> bool:
+def _other_world(folder: Path, config: SwarmConfig) -> tuple[str, Any, Any] | None:
     try:
-        return files.load(folder).config != config
+        return first_difference(files.load(folder).config, config)
     except ValueError:  # nothing, or what the loader asks to replace by another export
-        return False
+        return None
 
 
 def make_parser() -> Parser:

@@ -19,7 +19,7 @@ from quad_swarm.realtime.supervisor import SafetyLimits
 from quad_swarm.realtime.udp import check_group
 from quad_swarm.robot import Robot, RulePolicy, files
 from quad_swarm.validation import checked
-from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.presets import SwarmConfig, first_difference
 
 _MOST_BYTES = 2**20
 
@@ -113,18 +113,13 @@ def load(path: str | os.PathLike[str]) -> Team:
         raise ValueError(f"{path} describes no team: {shown(str(error))}.") from None
 
 
-def _difference(exported: Any, config: Any, path: str = "") -> str:
+def _difference(exported: Any, config: Any) -> str:
     """Say in which field two worlds differ first, and what to do."""
-    for one in dataclasses.fields(config):
-        old, new = getattr(exported, one.name), getattr(config, one.name)
-        if old == new or one.name in ("plant", "mismatch"):
-            continue
-        if dataclasses.is_dataclass(new) and type(old) is type(new):
-            return _difference(old, new, f"{path}{one.name}.")
-        name = f"{path}{one.name}"
-        given = "--n-robots {}" if name == "n_robots" else f"--world {name}={{}}"
-        return (
-            f"for {name}={old}, and this one has {new}; fly it as it was exported, with {given.format(old)}, or write "
-            f"it for this one with `sb3-maddpg export ... {given.format(new)}`"
-        )
-    raise AssertionError("the worlds are equal")
+    found = first_difference(exported, config, ("plant", "mismatch"))
+    assert found is not None
+    name, old, new = found
+    given = "--n-robots {}" if name == "n_robots" else f"--world {name}={{}}"
+    return (
+        f"for {name}={old}, and this one has {new}; fly it as it was exported, with {given.format(old)}, or write "
+        f"it for this one with `sb3-maddpg export ... {given.format(new)}`"
+    )

@@ -7,7 +7,7 @@ import functools
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -41,6 +41,9 @@ from quad_swarm.world.route import Targets
 from quad_swarm.world.scenarios import SCENARIOS, Extent, ScenarioSpace, extent, most_obstacles
 
 PRESET_VERSION = 1
+
+
+_FAR_OUTSIDE = 100.0  # of which nobody thinks in metres (m)
 
 
 @checked
@@ -524,6 +527,7 @@ class SwarmConfig:
             f"space.{field}={getattr(self.space, field)}: starts and goals of {scenario!r} lie up to "
             f"{beyond.max():.3g} m outside the workspace; give {smaller}planner.workspace_low={wider[0]} and "
             f"planner.workspace_high={wider[1]}; left out, both follow the room."
+            + (" Lengths are in metres." if beyond.max() > _FAR_OUTSIDE else "")
         )
 
     @property
@@ -545,6 +549,22 @@ class SwarmConfig:
     def is_random(self) -> bool:
         """Whether the world draws random numbers during an episode."""
         return bool(self.noise or self.sensing or self.radio.is_random or self.mismatch or self.clock_skew)
+
+
+def first_difference(one: Any, other: Any, ignored: Sequence[str] = (), path: str = "") -> tuple[str, Any, Any] | None:
+    """Return the first field in which two worlds differ, as ``--world`` names it, and its two values, None if there is
+    none.
+
+    :param ignored: names of the worlds' own fields that may differ
+    """
+    for each in fields(other):
+        here, there, name = getattr(one, each.name), getattr(other, each.name), f"{path}{each.name}"
+        if here == there or (not path and each.name in ignored):
+            continue
+        if is_dataclass(there) and type(here) is type(there):
+            return first_difference(here, there, path=f"{name}.")
+        return name, here, there
+    return None
 
 
 _SMALL_ROOM = ScenarioSpace(half_width=3.0, circle_radius=(2.5, 3.0), sector_radius=(1.5, 3.0))

@@ -493,11 +493,11 @@ class ScenarioSampler:
             return
         own = [SCENARIOS[one] for one in self._names if extent(SCENARIOS[one], self.space) is not None]
         most = _most(own, self.n_robots, self.space)
+        others = f"about {most} do" if most > 1 else "not even two do (lengths are in metres)"
         raise DoesNotFit(
             f"{self.n_robots} robots at least {self.space.spacing:g} m apart do not fit into the room of {name!r}; "
-            f"{f'about {most} do' if most > 1 else 'not even two do'}. Choose fewer robots, a smaller space.spacing, "
-            f"or for example space.{bounds.field}={_larger(bounds.field, self.n_robots, self.space)} if the workspace "
-            "is large enough."
+            f"{others}. Choose fewer robots, a smaller space.spacing, or for example "
+            f"space.{bounds.field}={_larger(bounds.field, self.n_robots, self.space)} if the workspace is large enough."
         )
 
     def _try_obstacles(self, name: str) -> None:

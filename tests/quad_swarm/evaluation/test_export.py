@@ -60,7 +60,7 @@ def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
 def test_an_export_is_not_replaced_by_one_for_another_world(tmp_path):
     export(MODEL, make_config("flight", n_robots=2), tmp_path)
     before = (tmp_path / files.DESCRIPTION).read_bytes()
-    with pytest.raises(ValueError, match="holds an export for another world"):
+    with pytest.raises(ValueError, match=r"another world, with radius=0\.3 instead of 0\.15: choose"):
         export(MODEL, make_config("flight", n_robots=2, radius=0.15), tmp_path)
     assert (tmp_path / files.DESCRIPTION).read_bytes() == before
     (tmp_path / files.DESCRIPTION).write_text("damaged")

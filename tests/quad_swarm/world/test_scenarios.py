@@ -242,6 +242,7 @@ def test_about_sixteen_robots_fit_on_the_circle_of_the_paper():
         ("symmetric_swap", {"circle_radius": [5, 6]}, r"space\.circle_radius=.* 'symmetric_swap' lie up to 1\.35 m"),
         ("asymmetric_swap", {"sector_radius": [2, 6]}, r"space\.sector_radius=.* 'asymmetric_swap' lie up to 1\.2 m"),
         ("mixed", {"heights": [4, 8]}, r"space\.heights=.* lie up to 5\.6 m outside"),
+        ("mixed", {"heights": [800, 1700]}, r"space\.heights=.* outside the workspace.* Lengths are in metres\.$"),
     ],
 )
 def test_a_room_beyond_a_given_workspace_is_refused_where_it_is_used(name, changes, message):
