@@ -7,6 +7,7 @@ other modules of this study.
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -45,11 +46,20 @@ from studies.swarm.version2 import BRAKING, OWN_MODEL, named
 
 APPENDICES = ("swarm_tables", "flight_tables", "teams", "robustness", "asking")
 RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
+FLIGHT = ("flight", "flight_policies", "flight_experiments")
 PAGES = (
     ROOT / "README.md",
     *(
         ROOT / "docs" / f"{page}.md"
-        for page in (*RESULTS, "swarm_learning", "flight", "flight_policies", "flight_experiments", "simulators")
+        for page in (
+            *RESULTS,
+            "swarm_learning",
+            "flight",
+            "flight_policies",
+            "flight_experiments",
+            "obstacles",
+            "simulators",
+        )
     ),
 )
 IMAGES = ROOT / "docs" / "images"
@@ -601,6 +611,36 @@ def cells_table(rows: Rows) -> str:
     return table(["scenario", *(f"{n} robots" for n in sizes), "full, all of these"], lines)
 
 
+def obstacles_table(rows: Rows) -> str:
+    """Format full communication and the packaged model of `flight-v2` among obstacles, with the braking reserve.
+
+    :param rows: rows of `studies.swarm.version2`; those of several sets are counted together
+    """
+    flown = [row for row in rows if row["plant"] == MODEL and row["set"] >= BRAKING]
+    lines = []
+    for n, name in itertools.product(sorted({row["n_robots"] for row in flown}), MOST_OBSTACLES):
+        here = [row for row in flown if (row["scenario"], row["n_robots"]) == (name, n)]
+        pair = [[row for row in here if row["policy"] == policy] for policy in (FULL, named(OWN_MODEL))]
+        figures = [merged(one) for one in pair]
+        near = [min(row["min_separation_quantiles"]["0.01"] for row in one) for one in pair]
+        beside = [min(row["min_obstacle_distance"] for row in one) for one in pair]
+        both = ", ".join
+        lines.append(
+            [
+                str(n),
+                name.replace("_", " "),
+                *(seeds_rate([one]) for one in figures),
+                both(f"{distance:.2f}" for distance in near),
+                both(f"{distance:.2f}" for distance in beside),
+                f"{figures[1]['request_share']:.1%}",
+                both(f"{one['arrived'] / one['episodes']:.1%}" for one in figures),
+                both(f"{one['steps_to_arrival']:.0f}" for one in figures),
+            ]
+        )
+    head = ["robots", "scenario", "full: collided", "learned: collided", "robots (m)", "obstacles (m)", "plans sent"]
+    return table([*head, "arrived", "steps"], lines)
+
+
 def seeds_rate(rows: Rows) -> str:
     """Format the collisions of several seeds in the same episodes, with the envelope of their intervals."""
     if not rows:
@@ -729,6 +769,7 @@ def main() -> None:
         "glance": glance_table(sealed_2, orca),
         "version 2": version_2_table(sealed_2, orca),
         "cells": cells_table(sealed_2),
+        "obstacles": obstacles_table(sealed_2),
         "flight": flight_table(rows["flight"]),
         "flight tuning": tuned_table(rows["flight_tuning"]),
         "flight targets": flight_targets(rows["flight"]),
