@@ -42,7 +42,7 @@ from studies.swarm.figures import (
 from studies.swarm.fly import PAPERS
 from studies.swarm.protocol import DATA, OF_TEAM, ROOT, best_rules, models
 from studies.swarm.tune_flight import FULL, SWAPS, best_rule
-from studies.swarm.version2 import BRAKING, OWN_MODEL, named
+from studies.swarm.version2 import BRAKING, MASK_ONLY, OWN_MODEL, named
 
 APPENDICES = ("swarm_tables", "flight_tables", "teams", "robustness", "asking")
 RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
@@ -531,7 +531,10 @@ def of_version_2(rows: Rows, orca: Rows, n_robots: int, page: str) -> dict[str, 
     :param page: address of the planner's page
     """
     here = [row for row in rows if hardest(row, n_robots) and row["plant"] == MODEL]
-    learned = [row for row in here if "flight-v2" in row["policy"] or "flight_v2_seed" in row["policy"]]
+    masked = [row for row in here if row["policy"] == named(MASK_ONLY)]
+    learned = [
+        row for row in here if row not in masked and ("flight-v2" in row["policy"] or "flight_v2_seed" in row["policy"])
+    ]
     seeds = len({row["policy"] for row in learned})
     groups = {
         "nobody tells anybody": [row for row in here if row["policy"] == "none"],
@@ -540,6 +543,7 @@ def of_version_2(rows: Rows, orca: Rows, n_robots: int, page: str) -> dict[str, 
             row for row in orca if hardest(row, n_robots) and row["preset"] == "flight-v2"
         ],
         f"best of {RULES_TRIED} rules, found in version 1": [row for row in here if row["policy"] == BEST_RULE],
+        "all whom the action mask allows": masked,
         "**learned**" + (f", {seeds} training seeds together" if seeds > 1 else ""): learned,
     }
     return {what: chosen for what, chosen in groups.items() if chosen}

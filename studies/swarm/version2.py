@@ -19,8 +19,9 @@ model among obstacles with the braking reserve; set 710 ``five_eight``, ``five_a
 other numbers with the packaged model, ``rule_again`` and ``none_again``, the best rule and no communication, and
 ``own_crazyflie`` and ``own_hummingbird``, the packaged model in the foreign simulators; set 713 ``reserve_four``,
 ``reserve_eight``, ``reserve_twelve`` and ``reserve_sixteen``, the flights that full communication needs to have 12,000
-of each scenario with obstacles and each number of robots. All parts before set 706 fly with equal penalties, those
-before set 709 without the reserve, as they did. JSON: one row per policy, scenario and
+of each scenario with obstacles and each number of robots; set 715 ``mask``, the packaged model at a threshold at which
+it asks and tells all whom its action mask allows. All parts before set 706 fly with equal penalties, those before set
+709 without the reserve, as they did. JSON: one row per policy, scenario and
 number of robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
 """
 
@@ -46,7 +47,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE = 713
+RESERVE, MASKED = 713, 715
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -59,6 +60,8 @@ ONE_MODEL = f"{models('flight')[4]}@0.5"
 SAFE_MODEL = f"{models('flight')[4]}@0.4"
 # The model that was trained in version 2, at the threshold that was chosen on sets 51 and 52
 OWN_MODEL = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.4"
+# All that its action mask allows
+MASK_ONLY = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.001"
 OTHER_SEEDS = tuple(f"studies/swarm/data/flight_v2_seed{seed}.zip@0.4" for seed in (1, 2, 3, 4))
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
@@ -147,6 +150,7 @@ PARTS = {
     "reserve_eight": Part(("full",), tuple(MOST_OBSTACLES), (8,), 8000, RESERVE),
     "reserve_twelve": Part(("full",), tuple(MOST_OBSTACLES), (12,), 10000, RESERVE),
     "reserve_sixteen": Part(("full",), tuple(MOST_OBSTACLES), (16,), 10000, RESERVE),
+    "mask": Part((MASK_ONLY,), SWAPS, (8, 16), 2000, MASKED),
 }
 
 

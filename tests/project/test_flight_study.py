@@ -41,8 +41,9 @@ def test_sets_of_episodes_are_apart():
         version2.BRAKING,
         version2.FIVE,
         version2.RESERVE,
+        version2.MASKED,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 19
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 20
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
