@@ -213,7 +213,7 @@ def draw_version_2(sealed: Rows, orca: Rows, tried: Rows, path: Path) -> None:
         _points(axes, [row for row in flown if row["policy"] == BEST_RULE], "D", INK, "best rule of version 1, sealed")
         none = [row for row in flown if row["policy"] == "none"]
         _points(axes, none, "X", RULES, "no communication, sealed")
-        learned = [r for r in flown if "flight-v2" in r["policy"] or "flight_v2_seed" in r["policy"]]
+        learned = [row for row in flown if as_shipped(row["policy"])]
         _points(axes, learned, "*", LEARNED, "learned, a mark for each training seed, sealed")
         full = [row for row in flown if row["policy"] == "full"]
         _points(axes, full, "s", COLOURS[0], "full communication, sealed")
@@ -241,6 +241,11 @@ def _finish(figure: Figure, panels: Sequence[Axes], path: Path) -> None:
     handles = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
     figure.savefig(path)
+
+
+def as_shipped(policy: str) -> bool:
+    """Return whether a policy is a training seed of the model of `flight-v2` at the threshold that ships."""
+    return ("flight-v2" in policy or "flight_v2_seed" in policy) and policy.endswith("@0.4")
 
 
 def hardest(row: dict[str, Any], n_robots: int) -> bool:

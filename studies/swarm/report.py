@@ -28,6 +28,7 @@ from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import absolute_path
 from studies.swarm.figures import (
     NAMES,
+    as_shipped,
     by_policy,
     draw_asking,
     draw_flight_fronts,
@@ -531,10 +532,7 @@ def of_version_2(rows: Rows, orca: Rows, n_robots: int, page: str) -> dict[str, 
     :param page: address of the planner's page
     """
     here = [row for row in rows if hardest(row, n_robots) and row["plant"] == MODEL]
-    masked = [row for row in here if row["policy"] == named(MASK_ONLY)]
-    learned = [
-        row for row in here if row not in masked and ("flight-v2" in row["policy"] or "flight_v2_seed" in row["policy"])
-    ]
+    learned = [row for row in here if as_shipped(row["policy"])]
     seeds = len({row["policy"] for row in learned})
     groups = {
         "nobody tells anybody": [row for row in here if row["policy"] == "none"],
@@ -543,7 +541,7 @@ def of_version_2(rows: Rows, orca: Rows, n_robots: int, page: str) -> dict[str, 
             row for row in orca if hardest(row, n_robots) and row["preset"] == "flight-v2"
         ],
         f"best of {RULES_TRIED} rules, found in version 1": [row for row in here if row["policy"] == BEST_RULE],
-        "all whom the action mask allows": masked,
+        "all whom the action mask allows": [row for row in here if row["policy"] == named(MASK_ONLY)],
         "**learned**" + (f", {seeds} training seeds together" if seeds > 1 else ""): learned,
     }
     return {what: chosen for what, chosen in groups.items() if chosen}
