@@ -212,7 +212,13 @@ def showing_options(parser: Parser, records: bool = False) -> None:
         metavar="N",
         help="number of steps (default %(default)s)",
     )
-    add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the newest, -1: no folder of its own")
+    add(
+        "--exp-id",
+        type=int,
+        default=0,
+        metavar="N",
+        help="number of the run; 0: the newest with a model, -1: no folder of its own",
+    )
     add("--env-kwargs", **_PAIRS, help="arguments of the environment, merged over those of the training")
     add("--seed", type=int, default=0, help="random seed (default %(default)s)")
     add("--load-best", action="store_true", help="the best model instead of the last")

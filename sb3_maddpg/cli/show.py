@@ -7,7 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from sb3_maddpg.cli.literals import parse_literal
 from sb3_maddpg.cli.overview import load_environments
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.recipe import check_env_kwargs, check_shown
-from sb3_maddpg.cli.runs import latest_number, name_of
+from sb3_maddpg.cli.runs import name_of, runs_of
 from sb3_maddpg.cli.safety import check_links, check_names, check_paths, read_settings
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidFileError
@@ -122,7 +122,7 @@ def _prepare(
     load_environments()
     find_environment(args.env)
     name, logs = name_of(args.env), Path(args.folder, args.algo)
-    number = args.exp_id or latest_number(logs, name)
+    number = args.exp_id or _newest_with_model(logs, name, args)
     run = logs / f"{name}_{number}" if number > 0 else logs
     settings, env_kwargs = run_settings(run, args.env, args.env_kwargs or {})
     check_env_kwargs(args.env, env_kwargs)
@@ -225,6 +225,19 @@ def run_settings(run: Path, env_id: str, given: Mapping[str, Any]) -> tuple[dict
         if isinstance(buffer := values.get("replay_buffer_class"), str):
             settings["replay_buffer_class"] = buffer
     return settings, {**env_kwargs, **given}
+
+
+def _newest_with_model(logs: Path, name: str, args: argparse.Namespace) -> int:
+    """:return: number of the newest run that has the model, or of the newest, 0 without any"""
+    runs = runs_of(logs, name)
+    newest = next(iter(runs), 0)
+    for number, run in runs.items():
+        with suppress(FileNotFoundError):
+            _model_path(run, name, args)
+            if number != newest:
+                print(f"Runs after {run.name} have no such model: they failed, or are not over.")
+            return number
+    return newest
 
 
 def _model_path(run: Path, name: str, args: argparse.Namespace) -> tuple[Path, str]:

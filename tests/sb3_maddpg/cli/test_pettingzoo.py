@@ -71,6 +71,12 @@ def test_a_pettingzoo_environment_without_a_window_is_watched_without(in_logs, m
     out = capsys.readouterr().out
     assert "has no window" in out
     assert "Mean episode length: 5.00" in out
+    failed = in_logs / "maddpg" / "quad_swarm-parallel_env_2"
+    failed.mkdir()
+    assert main(["enjoy", *swarm[:2], "-n", "10"]) == 0
+    assert "Runs after quad_swarm-parallel_env_1 have no such model" in capsys.readouterr().out
+    assert main(["enjoy", *swarm[:2], "-n", "10", "--exp-id", "2"]) == 1
+    assert f"there is no {failed.relative_to(Path.cwd())}" in capsys.readouterr().err
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
     if sys.platform == "linux":
