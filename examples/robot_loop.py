@@ -170,6 +170,20 @@ def fly(index, addresses, begins, duration, folder, rule, shared, team):
     return ", ".join(reasons - {"told to land"}) or None
 
 
+def watch(index, n_robots, folder, rule, shared):
+    """Print what one robot senses, twice a second until Ctrl-C, and command nothing."""
+    vehicle = MyVehicle(index, make_robot(index, n_robots, folder, rule).config, shared)
+    while True:
+        sensed = vehicle.sense()
+        pos, vel, angles = np.split(np.round(sensed.state, 2), 3)
+        print(
+            f"{(monotonic() - sensed.stamp) / 1000:.0f} ms ago: at {pos} m, {vel} m/s, roll, pitch, yaw {angles} rad; "
+            f"others at {np.round(sensed.pos, 2).tolist()} m",
+            flush=True,
+        )
+        time.sleep(0.5)
+
+
 def fly_all(duration, folder, rule):
     """Start a process for each robot on this machine."""
     link = UdpLink(0)
@@ -214,19 +228,27 @@ if __name__ == "__main__":
     parser.add_argument("--rule", help="a rule instead of the exported policy, such as none")
     parser.add_argument("--team", type=int, default=0, help="number of the team, if several share a network")
     parser.add_argument("--shared", metavar="FILE", help="states of the simulated vehicles")
+    parser.add_argument("--sense", action="store_true", help="print what this robot senses, and command nothing")
     parser.add_argument("--quick", action="store_true", help="fly for a second only")
     args = parser.parse_args()
     if not 0 < args.duration < np.inf:
         parser.error(f"--duration {args.duration:g}: it must be a number above 0")
     if args.index is None:
-        if args.addresses or args.begins or args.shared:
-            parser.error("--addresses, --begins and --shared need --index: which robot is this one?")
+        if args.addresses or args.begins or args.shared or args.sense:
+            parser.error("--addresses, --begins, --shared and --sense need --index: which robot is this one?")
         rule = args.rule if args.files else args.rule or "cpa:1.1s:2"  # asks those whom it would come close to
         sys.exit(fly_all(1.0 if args.quick else args.duration, args.files, rule))
-    if args.addresses is None or args.begins is None:
+    if args.addresses is None or (args.begins is None and not args.sense):
         parser.error("--index needs --addresses and --begins")
     if not args.files and not (args.rule and args.shared):
         parser.error("--index needs --files, which holds the world of your robots, also with --rule")
     if not 0 <= args.index < len(args.addresses):
         parser.error(f"--index {args.index}: there are {len(args.addresses)} addresses, from 0")
+    if args.sense:
+        try:
+            watch(args.index, len(args.addresses), args.files, args.rule, args.shared)
+        except KeyboardInterrupt:
+            sys.exit(0)
+        except ValueError as error:
+            sys.exit(f"robot {args.index}: {error}")
     sys.exit(fly(args.index, args.addresses, args.begins, args.duration, args.files, args.rule, args.shared, args.team))

@@ -53,6 +53,21 @@ def test_a_robot_lands_at_ctrl_c(tmp_path):
     assert said.count("landed") == 2
 
 
+def test_a_robot_says_what_it_senses_and_commands_nothing(tmp_path):
+    states = np.hstack([[[-2.0, 0, 1.5], [2.0, 0.1, 1.5]], np.zeros((2, 6))])
+    states.tofile(tmp_path / "states")
+    words = ["--index", "1", "--rule", "none", "--shared", str(tmp_path / "states"), "--sense"]
+    words += ["--addresses", "127.0.0.1:5", "127.0.0.1:6"]
+    command = [sys.executable, str(EXAMPLES / "robot_loop.py"), *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    said = process.stdout.readline() + process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=500)
+    assert process.returncode == 0
+    assert said.count("at [2.  0.1 1.5] m") == 2
+    assert "others at [[-2.0, 0.0, 1.5]] m" in said
+
+
 @pytest.mark.parametrize(
     ("goals", "message"),
     [

@@ -30,6 +30,8 @@ _LIGHT_AIR = 0.01  # wind in which offsets are linear (m/s)
 _SETTLING = 2.5  # time for which a disturbed velocity moves a robot (s)
 _UNITS = {"vel": "m/s", "attitude": "rad"}
 _FASTEST_TURN = 4 * math.pi  # of the yaw (rad/s)
+_LEAST_MARGIN = 0.05  # between robots beyond contact; in `flight`, with 0.04 some touch (m)
+_HIGH = 120.0  # as high as drones usually may fly (m)
 _CRUISE = 1.5  # how far robots at full speed aim, in distances that they fly within the horizon
 
 
@@ -374,6 +376,15 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
                 f"each other, or stay at a goal; use at most {0.5 * most:.1g}"
             )
     yield from _doubts_about_speed(config) if config.flies_quadrotors else ()
+    margin = planner.separation - 2 * config.radius
+    if config.flies_quadrotors and config.continuous_collisions and margin < _LEAST_MARGIN:
+        yield (
+            f"planner.separation={planner.separation:g} leaves {margin:.2g} m between robots before they touch, which "
+            "they do between the planner's steps; use at least "
+            f"{2 * config.radius + _LEAST_MARGIN:g}, or leave it out of make_config to follow the radius"
+        )
+    if (highest := max(config.space.heights)) > _HIGH:
+        yield f"space.heights={list(config.space.heights)}: robots fly {highest:g} m high; lengths are in metres"
     if planner.right_of_way > planner.separation:
         yield (
             f"planner.right_of_way={planner.right_of_way:g} is in metres and exceeds planner.separation="

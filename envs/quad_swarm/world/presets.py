@@ -494,40 +494,62 @@ class SwarmConfig:
                 f"choose a point at least {needed:.3g} m from its surface"
             )
 
-    def check_room(self, scenario: str, extent: Extent) -> None:
+    def check_room(self, scenario: str, bounds: Extent) -> None:
         """Check that the starts and goals of a scenario lie in the workspace.
 
-        :raises ValueError: if they may be farther outside than half of the goal radius; the message names the scenario
+        :raises ValueError: if they may be farther outside than half of the goal radius; the message names the scenario,
+            and what other scenarios need
         """
-        r = extent.radius
-        corners = np.array([[x, y, z] for x in (-r, r) for y in (-r, r) for z in (extent.low, extent.high)])
-        low, high = np.array(self.planner.workspace_low), np.array(self.planner.workspace_high)
-        beyond = np.maximum(low - corners, corners - high).max(axis=0)
+        beyond = self._beyond(bounds)
         if beyond.max() <= self._leeway:
             return
-        beside, above = beyond[:2].max(), beyond[2]
-        wider = np.array([[-r, -r, extent.low], [r, r, extent.high]])
-        wider = np.array([np.minimum(low, wider[0]), np.maximum(high, wider[1])]).round(3).tolist()
-        fitting: dict[str, list[float]] = {}  # fields that are too large, and the range that is not
-        if beside > self._leeway:
-            value = getattr(self.space, extent.field)
-            most = np.max(value) - beside
-            fitting[extent.field] = _inwards(min(np.min(value), most), most)
-        if above > self._leeway:
-            lowest, highest = self.space.heights
-            fitting["heights"] = _inwards(lowest + max(low[2] - extent.low, 0), highest - max(extent.high - high[2], 0))
-        field, smaller = next(iter(fitting)), ""
-        if all(least <= most and most > 0 for least, most in fitting.values()):
-            parts = (
-                f"space.{name}={found if isinstance(getattr(self.space, name), tuple) else found[1]}".replace(" ", "")
-                for name, found in fitting.items()
-            )
-            smaller = f"{' and '.join(parts)}, or "
+        r, low, high = bounds.radius, self.planner.workspace_low, self.planner.workspace_high
+        lowest = np.minimum(low, [-r, -r, bounds.low]).round(3).tolist()
+        highest = np.maximum(high, [r, r, bounds.high]).round(3).tolist()
+        fitting = self._narrowed(bounds)
+        field, smaller = next(iter(fitting)), self._assigned(fitting)
+        smaller = f"{smaller}, or, if there is that room, " if smaller else ""
+        others: dict[str, list[float]] = {}
+        for each in SCENARIOS.values():
+            if (place := extent(each, self.space)) is not None:
+                others |= self._narrowed(place)
+        needed = self._assigned({name: found for name, found in others.items() if name not in fitting})
         raise ValueError(
             f"space.{field}={getattr(self.space, field)}: starts and goals of {scenario!r} lie up to "
-            f"{beyond.max():.3g} m outside the workspace; give {smaller}planner.workspace_low={wider[0]} and "
-            f"planner.workspace_high={wider[1]}; left out, both follow the room."
+            f"{beyond.max():.3g} m outside the workspace; give {smaller}planner.workspace_low={lowest} and "
+            f"planner.workspace_high={highest}."
+            + (f" Other scenarios need {needed}, too." if needed else "")
             + (" Lengths are in metres." if beyond.max() > _FAR_OUTSIDE else "")
+        )
+
+    def _beyond(self, bounds: Extent) -> np.ndarray:
+        """Return how far the starts and goals of a scenario may be outside the workspace, (3,) (m), negative inside."""
+        r = bounds.radius
+        low, high = np.array(self.planner.workspace_low), np.array(self.planner.workspace_high)
+        return np.maximum(low - [-r, -r, bounds.low], np.array([r, r, bounds.high]) - high)
+
+    def _narrowed(self, bounds: Extent) -> dict[str, list[float]]:
+        """Return the fields of the room with which a scenario leaves the workspace, and ranges with which it does
+        not."""
+        beyond = self._beyond(bounds)
+        fitting: dict[str, list[float]] = {}
+        if (beside := beyond[:2].max()) > self._leeway:
+            value = getattr(self.space, bounds.field)
+            most = np.max(value) - beside
+            fitting[bounds.field] = _inwards(min(np.min(value), most), most)
+        if beyond[2] > self._leeway:
+            (lowest, highest), floor = self.space.heights, self.planner.workspace_low[2]
+            above = max(bounds.high - self.planner.workspace_high[2], 0)
+            fitting["heights"] = _inwards(lowest + max(floor - bounds.low, 0), highest - above)
+        return fitting
+
+    def _assigned(self, fitting: dict[str, list[float]]) -> str:
+        """Format ranges of the room as on the command line, nothing if one of them is empty."""
+        if not all(least <= most and most > 0 for least, most in fitting.values()):
+            return ""
+        return " and ".join(
+            f"space.{name}={found if isinstance(getattr(self.space, name), tuple) else found[1]}".replace(" ", "")
+            for name, found in fitting.items()
         )
 
     @property

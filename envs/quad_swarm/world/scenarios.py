@@ -493,11 +493,12 @@ class ScenarioSampler:
             return
         own = [SCENARIOS[one] for one in self._names if extent(SCENARIOS[one], self.space) is not None]
         most = _most(own, self.n_robots, self.space)
+        wider = _larger(bounds.field, self.n_robots, self.space)
         others = f"about {most} do" if most > 1 else "not even two do (lengths are in metres)"
         raise DoesNotFit(
             f"{self.n_robots} robots at least {self.space.spacing:g} m apart do not fit into the room of {name!r}; "
-            f"{others}. Choose fewer robots, a smaller space.spacing, or for example "
-            f"space.{bounds.field}={_larger(bounds.field, self.n_robots, self.space)} if the workspace is large enough."
+            f"{others}. Choose fewer robots, a smaller space.spacing"
+            + (f", or for example space.{bounds.field}={wider} if the workspace is large enough." if most > 1 else ".")
         )
 
     def _try_obstacles(self, name: str) -> None:

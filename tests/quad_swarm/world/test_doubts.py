@@ -119,6 +119,8 @@ def test_obstacles_that_come_are_not_doubtful():
         ("flight", {"planner": {"max_climb_rate": 0.026}}, r"max_steps=200: .* vertically"),
         ("flight-hard", {"planner": {"max_speed": 0.4}}, r"max_steps=300: .* 0\.4 m/s"),
         ("paper", {"space": {"circle_radius": [60, 70]}, "max_steps": 999}, r"goals are more than 41 m away"),
+        ("flight", {"planner": {"separation": 0.62}}, r"separation=0\.62 leaves 0\.02 m .* use at least 0\.65"),
+        ("flight", {"space": {"heights": [800, 801]}}, r"heights=\[800\.0, 801\.0\]: .* 801 m high; .* metres"),
         ("paper", {"planner": {"right_of_way": 30}}, r"right_of_way=30 is in metres and exceeds .*separation=0\.6"),
         ("paper", {"memory": 30}, r"memory=30: .* off by more than .* 0\.6 m"),
         ("paper", {"radio": {"delay": 50}}, r"radio\.delay=50 .* in steps of 0\.1 s.* at most 8 together"),
