@@ -49,7 +49,8 @@ class Experiment:
             given.setdefault("n_timesteps", args.n_timesteps)
         if given.get("noise_type", "") is None:  # which switches the recipe's noise off
             given = {key: value for key, value in given.items() if key not in ("noise_type", "noise_std")}
-        values = check_recipe(args.algo, given, f"recipe for {args.algo} in {source}")
+        origin = f"{source} with -params" if args.hyperparams else source
+        values = check_recipe(args.algo, given, f"recipe for {args.algo} in {origin}")
         self.shares = shares_parameters(self.algorithm, args.env)
         self._check_environments(values)
         self.env_kwargs = {**(values.get("env_kwargs") or {}), **(args.env_kwargs or {})}

@@ -87,6 +87,8 @@ def test_a_key_that_is_missing_is_named(capsys):
     assert "recipe for maddpg in r.yml: policy is missing" in refused(capsys, "--conf-file", "r.yml")
     Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {"policy": "MlpPolicy"}}))
     assert "n_timesteps is missing" in refused(capsys, "--conf-file", "r.yml")
+    words = refused(capsys, "--conf-file", "r.yml", "-params", "learning_rate:abc", "n_timesteps:10")
+    assert "recipe for maddpg in r.yml with -params: learning_rate='abc'" in words
     assert main(["train", "--env", "OwnBit-v0", "--conf-file", "r.yml", "-n", "20", "--verbose", "0"]) == 0
 
 
