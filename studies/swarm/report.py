@@ -50,18 +50,7 @@ RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES
 FLIGHT = ("flight", "flight_policies", "flight_experiments")
 PAGES = (
     ROOT / "README.md",
-    *(
-        ROOT / "docs" / f"{page}.md"
-        for page in (
-            *RESULTS,
-            "swarm_learning",
-            "flight",
-            "flight_policies",
-            "flight_experiments",
-            "obstacles",
-            "simulators",
-        )
-    ),
+    *(ROOT / "docs" / f"{page}.md" for page in (*RESULTS, "swarm_learning", *FLIGHT, "obstacles", "simulators")),
 )
 IMAGES = ROOT / "docs" / "images"
 VERSION_2 = ROOT / "studies" / "data"

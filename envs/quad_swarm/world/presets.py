@@ -512,8 +512,10 @@ class SwarmConfig:
         others: dict[str, list[float]] = {}
         for each in SCENARIOS.values():
             if (place := extent(each, self.space)) is not None:
-                others |= self._narrowed(place)
-        needed = self._assigned({name: found for name, found in others.items() if name not in fitting})
+                for name, (least, most) in self._narrowed(place).items():
+                    so_far = others.get(name, [least, most])
+                    others[name] = [max(least, so_far[0]), min(most, so_far[1])]
+        needed = self._assigned({name: found for name, found in others.items() if found != fitting.get(name)})
         raise ValueError(
             f"space.{field}={getattr(self.space, field)}: starts and goals of {scenario!r} lie up to "
             f"{beyond.max():.3g} m outside the workspace; give {smaller}planner.workspace_low={lowest} and "

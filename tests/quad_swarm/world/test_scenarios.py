@@ -224,14 +224,16 @@ def test_the_number_and_the_room_that_are_named_fit(name, n_robots):
         ScenarioSampler(name, 2 * int(found[1]) + 4, space)
 
 
-def test_all_that_leaves_a_workspace_is_said_at_once():
+@pytest.mark.parametrize("highest", [2.1, 2.6])
+def test_all_that_leaves_a_workspace_is_said_at_once(highest):
     given = {"workspace_low": (-1.5, -1.5, 0.5), "workspace_high": (1.5, 1.5, 2.0)}
+    room = {"radius": 0.15, "planner": given, "space": {"heights": (0.7, highest)}}
     with pytest.raises(ValueError, match="half_width=3") as caught:
-        ScenarioSampler("random", 2, SPACE, make_config("flight-v2", n_robots=2, radius=0.15, planner=given))
+        ScenarioSampler("random", 2, SPACE, make_config("flight-v2", n_robots=2, **room))
     fields = dict(re.findall(r"space\.(\w+)=(\[[^]]*\]|[0-9.]+)(?: and|,)", str(caught.value)))
     fitting = {name: ast.literal_eval(value) for name, value in fields.items()}
-    assert list(fitting) == ["half_width", "sector_radius", "circle_radius", "heights"]
-    config = make_config("flight-v2", n_robots=2, radius=0.15, planner=given, space=fitting)
+    assert fitting.keys() == {"half_width", "sector_radius", "circle_radius", "heights"}
+    config = make_config("flight-v2", n_robots=2, **{**room, "space": fitting})
     for name in without_obstacles():
         ScenarioSampler(name, 2, config.space, config)
 
