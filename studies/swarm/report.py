@@ -45,7 +45,7 @@ from studies.swarm.protocol import DATA, OF_TEAM, ROOT, best_rules, models
 from studies.swarm.tune_flight import FULL, SWAPS, best_rule
 from studies.swarm.version2 import BRAKING, MASK_ONLY, OWN_MODEL, named
 
-APPENDICES = ("swarm_tables", "flight_tables", "teams", "robustness", "asking")
+APPENDICES = ("paper_worlds", "swarm_tables", "flight_tables", "teams", "robustness", "asking")
 RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
 FLIGHT = ("flight", "flight_policies", "flight_experiments")
 PAGES = (
@@ -536,10 +536,13 @@ def of_version_2(rows: Rows, orca: Rows, n_robots: int, page: str) -> dict[str, 
     return {what: chosen for what, chosen in groups.items() if chosen}
 
 
-def glance_table(rows: Rows, orca: Rows) -> str:
+def glance_table(rows: Rows, orca: Rows, page: str) -> str:
     """Format the symmetric swap of eight robots in the sealed flights of `flight-v2`: what it is worth, what it costs.
-    See `of_version_2`."""
-    groups = of_version_2(rows, orca, 8, "docs/planner.md")
+    See `of_version_2`.
+
+    :param page: address of the planner's page
+    """
+    groups = of_version_2(rows, orca, 8, page)
     full = merged(groups["everybody tells everybody"])["steps_to_arrival"]
     lines = []
     for what, chosen in groups.items():
@@ -757,7 +760,8 @@ def main() -> None:
         "counterfactual": reference_table(rows["counterfactual"], "price"),
         "training": training_table(rows["training"]),
         "headline": headline_table(rows["flight"], best_rule()) if rows["flight"] else "Not flown yet.",
-        "glance": glance_table(sealed_2, orca),
+        "glance": glance_table(sealed_2, orca, "docs/planner.md"),
+        "results": glance_table(sealed_2, orca, "planner.md"),
         "version 2": version_2_table(sealed_2, orca),
         "cells": cells_table(sealed_2),
         "obstacles": obstacles_table(sealed_2),

@@ -58,7 +58,7 @@ def test_the_table_at_a_glance_says_what_it_costs():
     rows += [row(learned[1], 1, 0.02, 77.0), row(learned[1], 99, 0.5, 1.0, scenario="random")]
     rows += [row("full", 99, 1.0, 1.0, plant="rotorpy:hummingbird"), row("full", 99, 1.0, 1.0, n_robots=16)]
     orca = [row("none", 0, 0.0, 80.5, preset="flight-v2"), row("none", 99, 0.0, 1.0, preset="flight-hard")]
-    text = report.glance_table(rows, orca).replace("&nbsp;", " ").replace("<br>", " ")
+    text = report.glance_table(rows, orca, "planner.md").replace("&nbsp;", " ").replace("<br>", " ")
     cells = [line.strip("| ").split(" | ") for line in text.splitlines()[2:]]
     assert [line[1:] for line in cells] == [
         ["1,800 of 2,000 [88.61, 91.24] %", "0.0%", "-"],

@@ -121,7 +121,7 @@ def main(argv: list[str] | None = None) -> int:
         f"wrote {args.out / files.ACTOR} and {args.out / files.DESCRIPTION}: {config.n_robots} robots in {preset!r}, "
         f"{actor.observation.size} columns, {config.n_others * written.n_bits} bits\n"
         f"robots know this world only (--world changes it): radius {config.radius:g} m, separation "
-        f"{config.planner.separation:g} m, downwash {config.planner.downwash:g}, room "
+        f"{config.planner.separation:g} m, downwash {config.planner.downwash:g}, workspace "
         f"{list(config.planner.workspace_low)} to {list(config.planner.workspace_high)} m, "
         f"roll time constant {config.quadrotor.roll_time_constant:g} s"
     )
