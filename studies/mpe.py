@@ -32,13 +32,14 @@ import yaml
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy import stats
 
 from quad_swarm.figures.colours import RULES, STYLE, colour_of
 from sb3_maddpg import IDDPG, MADDPG, MASAC, MATD3
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.team import pettingzoo as parallel
 from sb3_maddpg.team.pettingzoo import TeamEnv
-from studies.learning import ROOT, interval
+from studies.learning import ROOT, interval, welch
 
 MODULES = {
     "simple_spread": "mpe2/simple_spread_v3",
@@ -50,7 +51,7 @@ ENVS = (*MODULES, "simple_spread:discrete")
 ALGOS: dict[str, type[TeamAlgorithm]] = {"maddpg": MADDPG, "matd3": MATD3, "masac": MASAC, "iddpg": IDDPG}
 OPPONENTS = {MODULES["simple_tag"], MODULES["simple_adversary"]}
 EVAL_FREQ, EVAL_EPISODES = 10_000, 100
-SHOWN = (50_000, 100_000)
+SHOWN = (50_000, 100_000, 500_000)
 # Mean returns that an implementation should reach, slightly worse than those of XuanCe and a plain PyTorch loop
 BARS = {("simple_spread", 50_000): -21.0, ("simple_spread", 100_000): -19.5}
 PACKAGES = ("sb3-maddpg", "stable-baselines3", "rl_zoo3", "torch", "numpy", "gymnasium", "pettingzoo", "mpe2")
@@ -206,13 +207,14 @@ def grouped(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[Row]]:
 
 
 def report(rows: Sequence[Row]) -> None:
-    """Print the table."""
+    """Print the table, and how MADDPG compares with each other algorithm at the end."""
+    shown = [at for at in SHOWN if any(at in row["timesteps"] for row in rows)]
     print(f"\nReturn, mean over the agents, of the policy without noise ({EVAL_EPISODES} episodes); 95 % t-interval.")
-    print(f"{'environment':32} {'actions':11} {'algorithm':9} {'seeds':>5}" + "".join(f"{at:>24,}" for at in SHOWN))
+    print(f"{'environment':32} {'actions':11} {'algorithm':9} {'seeds':>5}" + "".join(f"{at:>24,}" for at in shown))
     for (env, actions, algo), seeds in grouped(rows).items():
         line = f"{env:32} {actions:11} {algo:9} {len(seeds):5}"
         short = {module: name for name, module in MODULES.items()}[env]
-        for at in SHOWN:
+        for at in shown:
             values = [row["mean_return"][row["timesteps"].index(at)] for row in seeds if at in row["timesteps"]]
             cell = "{:.2f} ± {:.2f}".format(*interval(values)) if values else "-"
             if values and (bar := BARS.get((short, at))) is not None:
@@ -221,6 +223,36 @@ def report(rows: Sequence[Row]) -> None:
         print(line)
         if last := {name: [row["agents"][name] for row in seeds] for name in seeds[0]["agents"]}:
             print("    at the end: " + ", ".join(f"{name} {mean(values):.2f}" for name, values in last.items()))
+    found = comparisons(rows)
+    corrected = holm([one[2] for one in found.values()])
+    if found:
+        print("\nMADDPG minus another algorithm at the end, Welch's 95 % interval; p by Holm too.")
+    for ((env, actions, algo), (difference, half, p)), after in zip(found.items(), corrected, strict=True):
+        print(f"  {env:30} {actions:11} {algo:9} {difference:+.2f} ± {half:.2f}   p = {p:.3f}, corrected {after:.3f}")
+
+
+def comparisons(rows: Iterable[Row]) -> dict[tuple[str, str, str], tuple[float, float, float]]:
+    """
+    :return: difference of the last mean returns, half-width of its interval, and p of Welch's test, of MADDPG and each
+        other algorithm; without opponents, whose mean return says nothing
+    """
+    groups = grouped(row for row in rows if row["env"] not in OPPONENTS)
+    last = {group: [row["mean_return"][-1] for row in seeds] for group, seeds in groups.items()}
+    return {
+        (env, actions, algo): (*welch(own, values), float(stats.ttest_ind(own, values, equal_var=False).pvalue))
+        for (env, actions, algo), values in last.items()
+        if algo != "maddpg" and (own := last.get((env, actions, "maddpg"))) and min(len(own), len(values)) > 1
+    }
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """
+    :return: p-values corrected for their number, in the same order (Holm 1979)
+    """
+    order = np.argsort(p_values)
+    steps = np.array(p_values)[order] * np.arange(len(order), 0, -1)
+    corrected = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return corrected[np.argsort(order)].tolist()
 
 
 def random_return(env: str, actions: str) -> float:

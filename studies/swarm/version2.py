@@ -20,15 +20,18 @@ other numbers with the packaged model, ``rule_again`` and ``none_again``, the be
 ``own_crazyflie`` and ``own_hummingbird``, the packaged model in the foreign simulators; set 713 ``reserve_four``,
 ``reserve_eight``, ``reserve_twelve`` and ``reserve_sixteen``, the flights that full communication needs to have 12,000
 of each scenario with obstacles and each number of robots; set 715 ``mask``, the packaged model at a threshold at which
-it asks and tells all whom its action mask allows. All parts before set 706 fly with equal penalties, those before set
-709 without the reserve, as they did. JSON: one row per policy, scenario and
-number of robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
+it asks and tells all whom its action mask allows; set 716 ``orca_eight`` and ``orca_sixteen``, and, of what did not
+collide in 200 symmetric swaps of eight robots in ``studies/data/front.json``, the four cheapest rules and the model at
+0.5, ``cheap_eight`` and ``cheap_sixteen``. All parts before set 706 fly with equal penalties, those before set 709
+without the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`;
+written after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +50,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED = 713, 715
+RESERVE, MASKED, CHEAP = 713, 715, 716
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -62,6 +65,10 @@ SAFE_MODEL = f"{models('flight')[4]}@0.4"
 OWN_MODEL = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.4"
 # All that its action mask allows
 MASK_ONLY = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.001"
+BOLDER = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.5"
+CHEAP_RULES = ("plan:1.0s&stale:4", "stage:0.7:0.3", "stage:0.8:0.3", "cpa:1.0s:3&stale:8")
+# Of those who do not tell
+ORCA = "orca"
 OTHER_SEEDS = tuple(f"studies/swarm/data/flight_v2_seed{seed}.zip@0.4" for seed in (1, 2, 3, 4))
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
@@ -74,7 +81,7 @@ UNRESERVED = {"planner": {"braking_reserve": 0.0}}
 class Part(NamedTuple):
     """Policies that fly scenarios with some number of robots.
 
-    :param policies: the policies; `DELAY_CHECK` is no rule but `studies.swarm.delay_check`
+    :param policies: the policies; `DELAY_CHECK` is no rule but `studies.swarm.delay_check`, and `ORCA` another planner
     :param scenarios: names of the scenarios
     :param n_robots: numbers of robots
     :param episodes: number of episodes of each
@@ -151,6 +158,10 @@ PARTS = {
     "reserve_twelve": Part(("full",), tuple(MOST_OBSTACLES), (12,), 10000, RESERVE),
     "reserve_sixteen": Part(("full",), tuple(MOST_OBSTACLES), (16,), 10000, RESERVE),
     "mask": Part((MASK_ONLY,), SWAPS, (8, 16), 2000, MASKED),
+    "orca_eight": Part((ORCA,), SWAPS, (8,), 10000, CHEAP),
+    "orca_sixteen": Part((ORCA,), SWAPS, (16,), 2000, CHEAP),
+    "cheap_eight": Part((*CHEAP_RULES, BOLDER), SWAPS, (8,), 4000, CHEAP),
+    "cheap_sixteen": Part((*CHEAP_RULES, BOLDER), SWAPS, (16,), 1000, CHEAP),
 }
 
 
@@ -168,10 +179,17 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
             config = make_config(config, UNRESERVED)
         for scenario in part.scenarios:
             flown: dict[str, Rows] = {}
-            conditions = [condition(policy, scenario, config) for policy in part.policies if policy != DELAY_CHECK]
+            orca = make_config(config, {"planner": {"problem": "orca"}})
+            conditions = {
+                policy: replace(condition("none", scenario, orca), solver=ORCA)
+                if policy == ORCA
+                else condition(policy, scenario, config)
+                for policy in part.policies
+                if policy != DELAY_CHECK
+            }
             if conditions:
-                found = fly_all(conditions, count, part.set, executor=executor)
-                flown |= {one.policy: rows for one, rows in found.items()}
+                found = fly_all(list(conditions.values()), count, part.set, executor=executor)
+                flown |= {policy: found[one] for policy, one in conditions.items()}
             if DELAY_CHECK in part.policies:
                 first, checked = first_episode(part.set), make_config(config, CHECKED)
                 pieces = [range(first + k, first + min(k + 100, count)) for k in range(0, count, 100)]

@@ -1,7 +1,7 @@
 """The study of the disturbed worlds: its conditions, and that one setting has to do everywhere."""
 
 import itertools
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
@@ -42,8 +42,9 @@ def test_sets_of_episodes_are_apart():
         version2.FIVE,
         version2.RESERVE,
         version2.MASKED,
+        version2.CHEAP,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 20
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 21
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
@@ -458,6 +459,13 @@ def test_the_sealed_test_of_version_2_flies_its_parts(tmp_path, monkeypatch, cap
     assert [(row["n_robots"], row["policy"]) for row in rows] == expected
     assert [row["request_share"] for row in rows[:2]] == [0, 0]
     assert "symmetric_swap" in capsys.readouterr().out
+
+
+def test_orca_flies_the_sealed_test_as_a_planner_of_its_own():
+    part = version2.PARTS["orca_eight"]._replace(policies=(version2.ORCA, "none"))
+    orca, none = version2.fly(part._replace(scenarios=("symmetric_swap",)), 3, ThreadPoolExecutor(1))
+    assert (orca["policy"], orca["request_share"], orca["collisions"]) == ("orca", 0, 0)
+    assert none["collisions"] > 0
 
 
 def test_wind_moves_robots_beside_their_goals_unless_they_estimate_it():

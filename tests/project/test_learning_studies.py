@@ -63,6 +63,19 @@ def test_the_recorded_curves_are_those_of_the_table(capsys):
     assert [mean for mean in means if mean not in page] == []
 
 
+def test_comparisons_are_corrected_for_their_number(capsys):
+    # Holm's example has p-values whose corrected ones may not fall again
+    assert mpe.holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    rows = json.loads((DATA / "mpe2.json").read_text())["runs"]
+    found = mpe.comparisons(rows)
+    assert len(found) == 10
+    difference, half, p = found["mpe2/simple_speaker_listener_v4", "continuous", "iddpg"]
+    assert (difference, half, p) == pytest.approx((3.93, 3.75, 0.0431), abs=0.01)
+    assert min(mpe.holm([p for _, _, p in found.values()])) > 0.3
+    mpe.report(rows)
+    assert "mpe2/simple_speaker_listener_v4 continuous  iddpg     +3.93 ± 3.75" in capsys.readouterr().out
+
+
 def test_the_recorded_trainings_and_games_are_printed(capsys):
     for study in (learning, crossplay):
         rows = read_rows(DATA / f"{study.__name__.rpartition('.')[2]}.json")

@@ -4,6 +4,7 @@ import json
 import math
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,17 +13,21 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from network import alone
 
 pytest.importorskip("rclpy")
 
+from quad_swarm.evaluation.export import export
 from quad_swarm.realtime import Mode
 from quad_swarm.realtime.link import monotonic
 from quad_swarm.ros import plant_node
 from quad_swarm.ros.messages import msgs
 from quad_swarm.ros.node import make_node, quality
 from quad_swarm.ros.robot_node import PARAMETERS, RobotNode
+from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import make_config
+from sb3_maddpg.hub.pretrained import pretrained_folder
 
 ROOT = Path(__file__).parents[3]
 GOOD = {"policy": "full", "names": ["robot_0", "robot_1"], "index": 0}
@@ -383,3 +388,30 @@ with Operator(["robot_0", "robot_1"]) as operator:
 @pytest.mark.slow
 def test_robots_start_by_themselves_land_by_a_service_and_fly_again(tmp_path):
     run(ALONE, tmp_path)
+
+
+def test_the_file_of_the_walk_through_configures_a_robot_with_an_exported_policy(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+    page = (ROOT / "docs" / "ros2.md").read_text()
+    (text,) = (block for block in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "ros__parameters" in block)
+    parameters = yaml.safe_load(text)["/**"]["ros__parameters"]
+    assert (parameters["vehicle"], parameters["policy"]) == ("crazyswarm", "robots")
+    tutorial = (ROOT / "docs" / "tutorials" / "robots.md").read_text()
+    (room,) = re.findall(r"ROOM=\((.*?)\)\n", tutorial, re.DOTALL)
+    assert parameters["world"] == shlex.split(room)
+    config = make_config(
+        PARAMETERS["preset"],
+        read_assignments("world", parameters["world"]),
+        n_robots=len(parameters["names"]),
+    )
+    export(str(pretrained_folder("quad-swarm-flight-v2") / "model.zip"), config, tmp_path / "robots")
+    monkeypatch.chdir(tmp_path)
+    # Crazyswarm2's messages are no wheel
+    Path("robots.yaml").write_text(text.replace("vehicle: crazyswarm", "vehicle: odometry"))
+    node = RobotNode(["robot", "--ros-args", "-r", "__ns:=/cf1", "--params-file", "robots.yaml"])
+    try:
+        node.configure()
+        assert node.loop.robot.config.quadrotor == config.quadrotor
+        assert node.loop.supervisor.limits.room == ((-3, -3, 0), (3, 3, 3))
+    finally:
+        node.close()
