@@ -169,8 +169,10 @@ class _Maker:
         try:
             return self.spec.make(**kwargs)
         except (TypeError, LookupError, AttributeError, ArithmeticError) as error:  # from foreign code
+            # Gymnasium raises the environment's error again, and adds arguments that nobody gave
+            own = error.__context__ if type(error.__context__) is type(error) else error
             raise InvalidEnvironmentError(
-                f"{self.spec.id} cannot be created with {shown(kwargs)} ({told(error)})."
+                f"{self.spec.id} cannot be created with {shown(kwargs)} ({told(own)})."
             ) from error
 
 

@@ -80,8 +80,8 @@ class StoreValues(argparse.Action):
                     raise ValueError(f"'{key}' is given twice")
                 pairs[key] = parse_value(value)
         except ValueError as error:
-            text = f"{option_string} {shown(' '.join(values))}: {error}. Write key:value."
-            raise InvalidArgumentError(text) from error
+            remedy = "" if str(error).endswith("is not a finite number") else " Write key:value."
+            raise InvalidArgumentError(f"{option_string} {shown(' '.join(values))}: {error}.{remedy}") from error
         setattr(namespace, self.dest, pairs)
 
 

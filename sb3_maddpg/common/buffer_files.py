@@ -47,7 +47,9 @@ def read_buffer(archive: Archive, device: th.device | str) -> TeamReplayBuffer:
     """
     state, path = archive.json(_STATE), archive.name
     if state.get("format") != _FORMAT:
-        raise InvalidFileError(f"{path} holds no replay buffer of format {_FORMAT}.")
+        raise InvalidFileError(
+            f"{path} holds no replay buffer of format {_FORMAT}.{archive.content() if not state else ''}"
+        )
     cls, arguments, counters = (decode(state.get(key), f"{path}: {key}") for key in ("class", "arguments", "counters"))
     if not (isinstance(cls, type) and issubclass(cls, TeamReplayBuffer)):
         raise InvalidFileError(f"{path} holds a {shown(cls)}, but the model needs a TeamReplayBuffer.")

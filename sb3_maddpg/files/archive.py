@@ -162,6 +162,17 @@ class Archive:
         with self.open(name) as file:
             return read_json(file, f"{self.name}: {name}", MOST_JSON)
 
+    def content(self) -> str:
+        """:return: what the file seems to hold, as the end of a message; empty if nobody knows"""
+        names = {name.rpartition("/")[2] for name in self.members}
+        if {"data", "policy.pth"} <= names:
+            return " It is a model's file."
+        if "buffer.json" in names:
+            return " It is a replay buffer's file: read it with `load_replay_buffer`."
+        if "constants.pkl" in names:
+            return " It may be an exported agent: run it with `torch.jit.load`."
+        return ""
+
     def array(self, name: str) -> np.ndarray:
         """
         :param name: a member, as ``np.save`` writes it

@@ -74,7 +74,7 @@ def read_data(archive: Archive, algorithm: str, readable: set[str]) -> dict[str,
         raise InvalidFileError(f"{path} holds a model of {written_by}: load it with `{written_by}.load`.")
     if written_by is None and "policy_regularization" not in data:
         what = "a model of another algorithm than" if "policy_class" in data else "no model of"
-        raise InvalidFileError(f"{path} holds {what} {algorithm}.")
+        raise InvalidFileError(f"{path} holds {what} {algorithm}.{archive.content() if not data else ''}")
     if data.get("file_format", 1) not in _READABLE_FORMATS:
         raise InvalidFileError(
             f"{path} has format {data.get('file_format', 1)}, but this version of sb3-maddpg reads format "

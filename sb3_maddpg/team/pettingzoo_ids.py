@@ -85,8 +85,8 @@ def unknown(env_id: str) -> str:
     if slash and not any(name.startswith(f"{package}/") for name in ids):
         near = modules_beside(package) - sys.stdlib_module_names
         return (
-            f"Unknown environment '{env_id}': there is no module {env_id.replace('/', '.')} with a function "
-            "parallel_env, as PettingZoo's modules have. Is its package installed or in this folder?"
+            f"Unknown environment '{env_id}': there is no module {module} with a function parallel_env, as "
+            "PettingZoo's modules have. Is its package installed or in this folder?"
             f"{'' if package in near else did_you_mean(package, near)}"
         )
     if difflib.get_close_matches(env_id, ids, n=1):

@@ -92,7 +92,7 @@ def test_an_option_is_key_and_value():
     parser.add_argument("--env-kwargs", nargs="+", action=StoreValues)
     given = parser.parse_args(["--env-kwargs", "flag:false", "preset:dense"])
     assert given.env_kwargs == {"flag": False, "preset": "dense"}
-    for word in ("preset", "preset:", ":1", "n:nan"):
+    for word in ("preset", "preset:", ":1"):
         with pytest.raises(ValueError, match=r"--env-kwargs .*Write key:value"):
             parser.parse_args(["--env-kwargs", word])
 

@@ -100,6 +100,15 @@ def test_models_of_other_algorithms_are_refused(tmp_path, stream):
     th.save({"weights": 1}, tmp_path / "other.pt")
     with pytest.raises(ValueError, match=r"other\.pt holds no model of MADDPG"):
         MADDPG.load(tmp_path / "other.pt")
+    model = learned()
+    model.agent_policy(0).export(tmp_path / "agent.pt")
+    with pytest.raises(ValueError, match=r"holds no model of MADDPG\. It may be an exported agent: .*torch\.jit\.load"):
+        MADDPG.load(tmp_path / "agent.pt")
+    model.save_replay_buffer(tmp_path / "buffer.zip")
+    with pytest.raises(ValueError, match=r"holds no model of MADDPG\. It is a replay buffer's file"):
+        MADDPG.load(tmp_path / "buffer.zip")
+    with pytest.raises(ValueError, match=r"holds no replay buffer of format 1\. It is a model's file"):
+        model.load_replay_buffer(tmp_path / "maddpg.zip")
     with pytest.raises(ValueError, match="is a folder: name a model file in it"):
         MADDPG.load(tmp_path)
 
