@@ -89,6 +89,11 @@ def check_team(addresses, config):
     config.check_flight(STARTS, GOALS, config.obstacles.listed)
 
 
+def time_for(config):
+    """Return twice as long as the longest way takes at the speed limit, and some (s)."""
+    return 4 + 2 * float(np.linalg.norm(GOALS - STARTS, axis=1).max()) / config.planner.max_speed
+
+
 def open_link(index, addresses, session):
     """Return the link of a robot to the others, whose session all share."""
     (host, port), others = addresses[index], {k: a for k, a in enumerate(addresses) if k != index}
@@ -109,6 +114,7 @@ def fly(index, addresses, begins, duration, folder, rule, shared, team):
     except ValueError as error:
         raise SystemExit(f"robot {index}: {error}") from None
     config = robot.config
+    duration = duration or time_for(config)
     if not 0 < (ahead := begins / 1e6 - time.time()) < 600:
         now = time.time_ns() // 1000
         raise SystemExit(
@@ -199,8 +205,9 @@ def fly_all(duration, folder, rule):
         shared = Path(motion_capture) / "states"
         np.hstack([STARTS, np.zeros((len(STARTS), 6))]).tofile(shared)
         words = ["--addresses", *addresses, "--begins", str(time.time_ns() // 1000 + 20_000_000)]
-        words += ["--duration", str(duration), "--shared", str(shared)]
-        words += [word for name, value in (("--files", folder), ("--rule", rule)) if value for word in (name, value)]
+        words += ["--shared", str(shared)]
+        given = (("--files", folder), ("--rule", rule), ("--duration", duration))
+        words += [str(word) for name, value in given if value for word in (name, value)]
         command = [sys.executable, __file__]
         robots = [subprocess.Popen([*command, "--index", str(k), *words]) for k in range(len(STARTS))]
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the robots, which land
@@ -223,7 +230,12 @@ if __name__ == "__main__":
         "--addresses", nargs="+", type=address, metavar="HOST:PORT", help="where robots receive, by their numbers"
     )
     parser.add_argument("--begins", type=int, metavar="US", help="when all begin: microseconds of the time of the day")
-    parser.add_argument("--duration", type=float, default=6.0, metavar="S", help="when to land, after that")
+    parser.add_argument(
+        "--duration",
+        type=float,
+        metavar="S",
+        help="when to land, after that (default: 4 s, and twice what the longest way takes at the speed limit)",
+    )
     parser.add_argument("--files", metavar="FOLDER", help="an exported policy and its world")
     parser.add_argument("--rule", help="a rule instead of the exported policy, such as none")
     parser.add_argument("--team", type=int, default=0, help="number of the team, if several share a network")
@@ -231,7 +243,7 @@ if __name__ == "__main__":
     parser.add_argument("--sense", action="store_true", help="print what this robot senses, and command nothing")
     parser.add_argument("--quick", action="store_true", help="fly for a second only")
     args = parser.parse_args()
-    if not 0 < args.duration < np.inf:
+    if args.duration is not None and not 0 < args.duration < np.inf:
         parser.error(f"--duration {args.duration:g}: it must be a number above 0")
     if args.index is None:
         if args.addresses or args.begins or args.shared or args.sense:

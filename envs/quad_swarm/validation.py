@@ -7,6 +7,7 @@ Text is converted to the value it stands for ("false", "1e-3", "10"), as it come
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
 import inspect
 import itertools
@@ -27,6 +28,8 @@ T = TypeVar("T")
 R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 
+# Similarity from which on a name is taken for a mistyped one of another level
+_CLOSE = 0.75
 _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
@@ -427,7 +430,13 @@ def _entries(owner: Any, place: Sequence[Any]) -> int | None:
 def _deeper(owner: Any, name: str) -> list[str]:
     """Return where a name is a field of the dataclasses that the fields of one hold."""
     held = {field: _dataclass_in(annotation) for field, annotation in get_type_hints(owner).items()}
-    return [f"{field}.{name}" for field, one in held.items() if one is not None and name in _names(one)]
+    near = difflib.get_close_matches(name, _names(owner), 1, _CLOSE)
+    return [
+        f"{field}.{found}"
+        for field, one in held.items()
+        if one is not None
+        for found in difflib.get_close_matches(name, _names(one), 1, 1.0 if near else _CLOSE)
+    ]
 
 
 def _dataclass_in(annotation: Any) -> Any:

@@ -120,12 +120,14 @@ def _check_room(config: SwarmConfig, limits: SafetyLimits) -> None:
     for name, gaps, corner in (("workspace_low", below, 0), ("workspace_high", above, 1)):
         axis = int((gaps - needed).argmin())
         if gaps[axis] < needed[axis] - 1e-9:
-            slower = "" if axis == 2 else f", lower planner.max_speed={planner.max_speed:g}"
+            slower = "" if axis == 2 else f", a planner.max_speed below {planner.max_speed:g}"
+            wall, sign = limits.room[corner][axis], 1 - 2 * corner
             raise ValueError(
                 f"limits.room: {gaps[axis]:.3g} m between planner.{name}[{axis}]={getattr(planner, name)[axis]:g} and "
-                f"the wall at {limits.room[corner][axis]:g}, but a robot that is noticed at the fence "
-                f"({limits.fence:g} m) needs {needed[axis]:.3g} m to stop: make the workspace smaller{slower}, or "
-                "lower limits.fence"
+                f"the {'ceiling' if axis == 2 else 'wall'} at {wall:g}, but a robot that is noticed at the fence "
+                f"({limits.fence:g} m) needs {needed[axis]:.3g} m to stop: give planner.{name}[{axis}]="
+                f"{round(wall + sign * needed[axis], 3):g}{slower}"
+                + (", or a lower limits.fence" if needed[axis] - limits.fence < gaps[axis] else "")
             )
 
 

@@ -32,7 +32,7 @@ from __future__ import annotations
 import importlib
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -121,6 +121,24 @@ def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[st
     if values["vehicle"] not in makers:
         raise unknown_name("vehicle", values["vehicle"], makers)
     return makers[values["vehicle"]]()
+
+
+def check_walls(world: Sequence[str], limits: Mapping[str, Any]) -> None:
+    """Check that whoever starts real vehicles has said how large their room is.
+
+    :raises ValueError: if there is no field of the world, or no ``room`` among the limits
+    """
+    if not world:
+        raise ValueError(
+            "world: give your robots' radius, planner.max_speed and workspace, as in "
+            '["radius=0.15", "planner.max_speed=1", "planner.workspace_low=[-2,-2,0.5]", ...]; those of the preset are '
+            "another room's"
+        )
+    if "room" not in limits:
+        raise ValueError(
+            'limits: give the lowest and the highest corner between your walls, as in ["room=[[-3,-3,0],[3,3,3]]", '
+            '"fence=0.3"], or ["room=null"] where there are none'
+        )
 
 
 def reachable(goal: Any, config: SwarmConfig) -> np.ndarray:
@@ -265,7 +283,8 @@ class RobotNode:
             values["preset"], read_assignments("world", texts("world", values["world"])), n_robots=len(names)
         )
         standing(config)
-        limits = SafetyLimits(**read_assignments("limits", texts("limits", values["limits"])))
+        given = read_assignments("limits", texts("limits", values["limits"]))
+        limits = SafetyLimits(**given)
         team = Team(config, values["policy"], limits, values["wait"], values["late"], priority=values["priority"])
         if index == -1 and (place := self.node.get_namespace().strip("/")) in names:
             index = names.index(place)
@@ -289,6 +308,8 @@ class RobotNode:
         link = RosLink(self.node, self._mailbox, index, names)
         period = round(config.planner.dt * 1e6)
         vehicle = make_vehicle((self.node, self._mailbox, link, names), values, period)
+        if values["vehicle"] != "odometry":
+            check_walls(values["world"], given)
         self._status = self.node.create_publisher(msgs().DiagnosticArray, f"/{name}/status", quality(5))
         # Goals must arrive; whoever sends one to a robot that does not fly yet is told so by the log
         self._mailbox.subscribe(msgs().PoseStamped, f"/{name}/goal_pose", 10, self._take_goal)

@@ -341,7 +341,8 @@ class SwarmConfig:
         tolerance = self.collision_tolerance
         self._check_inside("starts", starts)
         self._check_apart("starts", starts, lambda kind: 2 * kind.radius - tolerance, "robots touch")
-        self._check_clear("starts", starts, around, self.radii - tolerance, "the robot touches it")
+        kept = self.per_robot(lambda kind: kind.radius + kind.obstacle_margin)
+        self._check_clear("starts", starts, around, self.radii - tolerance, kept, "the robot touches it")
         return starts, self.check_goals(starts, goals, around, velocities, waypoints)
 
     def check_goals(
@@ -361,15 +362,16 @@ class SwarmConfig:
         """
         targets = Targets.of(goals, velocities, waypoints, self.n_robots)
         tolerance, goal_radius = self.collision_tolerance, self.goal_radius
-        kept = self.per_robot(lambda kind: kind.radius + max(kind.obstacle_margin - goal_radius, -tolerance))
+        kept = self.per_robot(lambda kind: kind.radius + kind.obstacle_margin)
+        least = self.per_robot(lambda kind: kind.radius + max(kind.obstacle_margin - goal_radius, -tolerance))
         stands = np.logical_not(around.velocity.any(axis=1))
         self._check_inside("goals", targets.goals)
         why = "robots that keep their distance cannot be at both goals"
         self._check_apart("goals", targets.goals, lambda kind: kind.least_spacing - tolerance, why)
-        passed = ((f"waypoints[{k}]", one, kept[k : k + 1]) for k, one in enumerate(targets.waypoints))
-        for name, one, clear in (("goals", targets.goals, kept), *passed):
+        passed = ((f"waypoints[{k}]", one, slice(k, k + 1)) for k, one in enumerate(targets.waypoints))
+        for name, one, of in (("goals", targets.goals, slice(None)), *passed):
             self._check_inside(name, one)
-            self._check_clear(name, one, around, clear, "the planner keeps robots away", stands)
+            self._check_clear(name, one, around, least[of], kept[of], "the planner keeps robots away", stands)
         far = [far_goals(kind) for kind in self.kinds]
         legs = zip(self.kind_of, places, targets.waypoints, targets.goals, strict=True)
         doubtful = {
@@ -451,20 +453,25 @@ class SwarmConfig:
             )
 
     def _check_apart(self, name: str, places: np.ndarray, least: Callable[[SwarmConfig], float], why: str) -> None:
-        """Check that no two points are closer than a distance between robots of a kind allows."""
-        needed: Any = least(self)
-        if self.vehicles:  # what a robot needs beyond contact, it needs from all others
-            beyond = self.per_robot(lambda kind: least(kind) - 2 * kind.radius)
-            needed = self.radii[:, None] + self.radii + np.maximum(beyond[:, None], beyond)
-        downwash = self.planner.downwash
+        """Check that no two points are closer than a distance between robots of a kind allows. The error proposes the
+        distance that planners keep."""
+        needed, downwash = self._pairwise(least), self.planner.downwash
         i, j, distance = _closest(places * (1, 1, 1 / downwash), needed)
-        needed = np.broadcast_to(needed, (len(places), len(places)))[i, j]
-        if distance < needed:
+        if distance < needed[i, j]:
+            kept = max(self._pairwise(lambda kind: kind.planner.separation)[i, j], needed[i, j])
             metric = "" if downwash == 1 else f" (vertical distances count 1 / {downwash:g}, planner.downwash)"
             raise ValueError(
                 f"{name}[{i}] and {name}[{j}] are {distance:.3g} m apart{metric}, where {why}: place them at least "
-                f"{needed + self.collision_tolerance:.3g} m apart"
+                f"{kept + self.collision_tolerance:.3g} m apart"
             )
+
+    def _pairwise(self, least: Callable[[SwarmConfig], float]) -> np.ndarray:
+        """Return a distance between robots of a kind for all pairs of robots, (n, n) (m)."""
+        if not self.vehicles:
+            return np.full((self.n_robots, self.n_robots), least(self))
+        # What a robot needs beyond contact, it needs from all others
+        beyond = self.per_robot(lambda kind: least(kind) - 2 * kind.radius)
+        return self.radii[:, None] + self.radii + np.maximum(beyond[:, None], beyond)
 
     def _check_clear(
         self,
@@ -472,12 +479,14 @@ class SwarmConfig:
         places: np.ndarray,
         around: Surroundings,
         least: np.ndarray,
+        kept: np.ndarray,
         why: str,
         which: np.ndarray | None = None,
     ) -> None:
         """Check the distances of points to obstacles, or only to some of them, (K,) bool.
 
         :param least: the least distance of each point, or of all, (n,) or (1,) (m)
+        :param kept: the distance that planners keep, which the error proposes
         """
         there = around.radius > 0 if which is None else which & (around.radius > 0)
         if not there.any() or not len(places):
@@ -491,7 +500,7 @@ class SwarmConfig:
             raise ValueError(
                 f"{name}[{robot}]={places[robot].tolist()} is {where} obstacle {number} (radius "
                 f"{around.radius[number]:.3g} m, centre {np.round(around.position[number], 3).tolist()}), where {why}: "
-                f"choose a point at least {needed:.3g} m from its surface"
+                f"choose a point at least {kept[robot % len(kept)]:.3g} m from its surface"
             )
 
     def check_room(self, scenario: str, bounds: Extent) -> None:
@@ -507,20 +516,29 @@ class SwarmConfig:
         lowest = np.minimum(low, [-r, -r, bounds.low]).round(3).tolist()
         highest = np.maximum(high, [r, r, bounds.high]).round(3).tolist()
         fitting = self._narrowed(bounds)
-        field, smaller = next(iter(fitting)), self._assigned(fitting)
-        smaller = f"{smaller}, or, if there is that room, " if smaller else ""
-        others: dict[str, list[float]] = {}
+        field = next(iter(fitting))
+        tightest: dict[str, list[float]] = {}
         for each in SCENARIOS.values():
             if (place := extent(each, self.space)) is not None:
                 for name, (least, most) in self._narrowed(place).items():
-                    so_far = others.get(name, [least, most])
-                    others[name] = [max(least, so_far[0]), min(most, so_far[1])]
-        needed = self._assigned({name: found for name, found in others.items() if found != fitting.get(name)})
+                    so_far = tightest.get(name, [least, most])
+                    tightest[name] = [max(least, so_far[0]), min(most, so_far[1])]
+        # One value of each field, with which the others fit, too
+        smaller = self._assigned({name: tightest[name] for name in fitting}) or self._assigned(fitting)
+        smaller = f"{smaller}, or, if walls and ceiling are far enough, " if smaller else ""
+        needed = self._assigned({name: found for name, found in tightest.items() if name not in fitting})
+        middle = (np.add(low, high) / 2)[:2]
         raise ValueError(
             f"space.{field}={getattr(self.space, field)}: starts and goals of {scenario!r} lie up to "
             f"{beyond.max():.3g} m outside the workspace; give {smaller}planner.workspace_low={lowest} and "
             f"planner.workspace_high={highest}."
             + (f" Other scenarios need {needed}, too." if needed else "")
+            + (
+                f" Scenarios lie around x = y = 0, but the middle of the workspace is {middle.round(3).tolist()}: move "
+                "the origin of your frame there."
+                if np.abs(middle).max() > (np.subtract(high, low) / 4)[:2].min()
+                else ""
+            )
             + (" Lengths are in metres." if beyond.max() > _FAR_OUTSIDE else "")
         )
 

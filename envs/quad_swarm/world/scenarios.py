@@ -497,7 +497,8 @@ class ScenarioSampler:
         others = f"about {most} do" if most > 1 else "not even two do (lengths are in metres)"
         raise DoesNotFit(
             f"{self.n_robots} robots at least {self.space.spacing:g} m apart do not fit into the room of {name!r}; "
-            f"{others}. Choose fewer robots, a smaller space.spacing"
+            f"{others}. Choose fewer robots, a smaller "
+            + ("space.spacing" if self.world is None else f"radius than {self.world.radius:g} or space.spacing")
             + (f", or for example space.{bounds.field}={wider} if the workspace is large enough." if most > 1 else ".")
         )
 

@@ -19,7 +19,7 @@ ARGUMENTS = {
     "plant": ("", "simulated vehicle, such as crazyflow:cf21B_500; the preset's if empty"),
     "simulated": ("true", "whether to start the simulated world"),
     "parameters": ("", "file with more parameters of all robots; they replace those above"),
-    "autostart": ("true", "whether robots configure themselves, and activate themselves in the air"),
+    "autostart": ("", "whether robots configure and activate themselves in the air; if empty, simulated ones do"),
     "priority": ("0", "real-time priority of the robots, 1 to 99; 0 for none"),
 }
 _LANDS = "30"  # s after Ctrl-C before a robot that still lands is killed
@@ -33,7 +33,7 @@ def robot(name, names, values):
         "preset": values["preset"],
         "vehicle": values["vehicle"],
         "priority": int(values["priority"]),
-        "autostart": values["autostart"] == "true",
+        "autostart": (values["autostart"] or values["simulated"]) == "true",
     }
     files = [values["parameters"]] if values["parameters"] else []
     return LifecycleNode(

@@ -24,7 +24,7 @@ from quad_swarm.realtime.link import monotonic
 from quad_swarm.ros import plant_node
 from quad_swarm.ros.messages import msgs
 from quad_swarm.ros.node import make_node, quality
-from quad_swarm.ros.robot_node import PARAMETERS, RobotNode
+from quad_swarm.ros.robot_node import PARAMETERS, RobotNode, check_walls
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import make_config
 from sb3_maddpg.hub.pretrained import pretrained_folder
@@ -352,6 +352,24 @@ def test_the_launch_file_gives_the_nodes_their_parameters(monkeypatch):
         assert one["parameters"][0].keys() <= PARAMETERS.keys()
         assert one["parameters"][0]["names"] == ["robot_0", "robot_1", "robot_2"]
         assert one["parameters"][0]["autostart"] is True
+    made.clear()
+    values["simulated"] = "false"
+    launch["start"](None)
+    started = [options["parameters"][0]["autostart"] for kind, _, options in made if kind == "LifecycleNode"]
+    assert started == [False] * 3
+
+
+def test_real_vehicles_say_how_large_their_room_is(make, monkeypatch):
+    monkeypatch.setattr("quad_swarm.ros.robot_node.make_vehicle", lambda robot, values, period: SimpleNamespace())
+    given = {**GOOD, "vehicle": "crazyswarm"}
+    for parameters, reason in (
+        ({}, "world: give your robots' radius"),
+        ({"world": ["radius=0.2"]}, "limits: give the lowest and the highest corner between your walls"),
+        ({"world": ["radius=0.2"], "limits": ["room=[[-5,-5,0],[5,5,3]]"]}, "needs 4.4 m to stop"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(reason)):
+            make(**given, **parameters).configure()
+    check_walls(["radius=0.2"], {"room": None})
 
 
 @pytest.mark.slow
