@@ -27,6 +27,7 @@ from quad_swarm.jobs.journal import default_folder
 from quad_swarm.parsing import Parser
 from quad_swarm.planner import PROBLEMS, SOLVERS, BuildError
 from quad_swarm.plants.base import MODEL, PlantError, simulated_vehicles
+from quad_swarm.realtime.supervisor import SafetyLimits, Supervisor
 from quad_swarm.task.rules import RULES
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_config
@@ -49,6 +50,8 @@ class Column(NamedTuple):
     """Whether only the wide table has this column"""
     needs: str | None = None
     """A name that rows need; the table has the column if any row has it"""
+    unless: tuple[str, str] | None = None
+    """Two names; without them being different in any row, only the wide table has the column"""
 
 
 COLUMNS = [
@@ -65,7 +68,12 @@ COLUMNS = [
     ),
     Column("> 1 cm", lambda r: str(r["collisions_1cm"])),
     Column("at steps", lambda r: str(r["collisions_at_steps"])),
-    Column("any time", lambda r: f"{r['collisions_continuous'] / r['episodes']:.1%}", False),
+    Column(
+        "any time",
+        lambda r: f"{r['collisions_continuous'] / r['episodes']:.1%}",
+        wide=False,
+        unless=("collisions", "collisions_continuous"),
+    ),
     Column("plans/step", lambda r: f"{r['requests_per_step']:.2f}"),
     Column("plans", lambda r: f"{r['request_share']:.2%}", False),
     Column("B/s", lambda r: f"{r['bytes_per_second']:.0f}"),
@@ -73,10 +81,11 @@ COLUMNS = [
     Column("arrived", lambda r: f"{r['arrived']}/{r['episodes']}", False),
     Column("steps", lambda r: "-" if r["steps_to_arrival"] is None else f"{r['steps_to_arrival']:.1f}", False),
     Column("lost (s)", lambda r: "-" if r.get("time_lost") is None else f"{r['time_lost']:+.2f}"),
-    Column("min. dist. (m)", lambda r: f"{r['min_separation_continuous']:.3f}"),
+    Column("min. (m)", lambda r: f"{r['min_separation_continuous']:.2f}", False),
     Column(
-        "to obst. (m)",
-        lambda r: "-" if r["min_obstacle_distance"] is None else f"{r['min_obstacle_distance']:.3f}",
+        "obstacle (m)",
+        lambda r: "-" if r["min_obstacle_distance"] is None else f"{r['min_obstacle_distance']:.2f}",
+        wide=False,
         needs="min_obstacle_distance",
     ),
     Column("failures", lambda r: str(r["planner_failures"])),
@@ -96,7 +105,9 @@ def table_texts(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> list[l
     columns = [
         column
         for column in COLUMNS
-        if (wide or not column.wide) and (column.needs is None or any(column.needs in row for row in rows))
+        if (wide or not column.wide)
+        and (column.needs is None or any(column.needs in row for row in rows))
+        and (wide or column.unless is None or any(row[column.unless[0]] != row[column.unless[1]] for row in rows))
     ]
     names = short_names(row["policy"] for row in rows)
     shown = [{**row, "policy": names[row["policy"]]} for row in rows]
@@ -123,8 +134,8 @@ def format_table(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> str:
 def _wrapped(texts: list[str], most: int) -> list[list[str]]:
     """Return a line of the table, and additional lines for the rest of the policy's name."""
     scenario, name, *cells = texts
-    # Behind operators of rules and in front of thresholds, if there is such a place
-    first, *rest = re.findall(rf".{{1,{most}}}(?:(?<=[&|/])|(?=@)|$)|.{{1,{most}}}", name)
+    # Behind operators of rules and hyphens, and in front of thresholds, if there is such a place
+    first, *rest = re.findall(rf".{{1,{most}}}(?:(?<=[&|/-])|(?=@)|$)|.{{1,{most}}}", name)
     return [[scenario, first, *cells], *(["", part, *("" for _ in cells)] for part in rest)]
 
 
@@ -188,6 +199,7 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
         metavar="NAME=VALUE",
         help=f"fields of the preset, e.g. noise.wind=1 or planner.problem=NAME ({', '.join(PROBLEMS)}): {names}",
     )
+    add_limits_argument(parser)
     simulated = ", ".join(simulated_vehicles())
     parser.add_argument("--plant", help=f"simulated vehicle: {MODEL} (default), or one of a simulator ({simulated})")
     parser.add_argument(
@@ -207,6 +219,30 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
+def add_limits_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the option of what robots will be guarded by, see `check_limits`."""
+    parser.add_argument(
+        "--limits",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help="fields of the robots' SafetyLimits, e.g. room=[[-3,-3,0],[3,3,3]] fence=0.3: a world in which robots "
+        "could brake into a wall or the ceiling is refused. They change no flight",
+    )
+
+
+def check_limits(assignments: Sequence[str], config: SwarmConfig) -> None:
+    """Check that robots may be guarded by limits in a world, see `Supervisor`.
+
+    :param assignments: values of ``--limits``
+    :raises ValueError: if they are invalid or do not fit the world
+    """
+    limits = SafetyLimits(**read_assignments("--limits", assignments))
+    for robot in range(config.n_robots if assignments else 0):
+        Supervisor(config, limits, robot)
+
+
 def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[Condition]:
     """Create the conditions of a command line: its policies in some scenarios. Sets ``args.preset`` if it is missing.
 
@@ -220,6 +256,7 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
     models = {policy: trained_in(load_model(policy, args.algo)) for policy in args.policy if is_model(policy)}
     args.preset = args.preset or preset_of(models)
     config = make_config(args.preset, read_assignments("--world", args.world), n_robots=args.n_robots, plant=args.plant)
+    check_limits(args.limits, config)
     for policy, trained in models.items():
         if (preset := trained.get("preset", args.preset)) != args.preset:
             print(f"note: {short_name(policy)} was trained in {preset!r}, but this is {args.preset!r}", file=sys.stderr)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from quad_swarm.errors import needs_extra, shown
-from quad_swarm.evaluation.command import preset_of
+from quad_swarm.evaluation.command import add_limits_argument, check_limits, preset_of
 from quad_swarm.evaluation.policies import OBSERVATION_ARGUMENTS, fitted, is_model, load_model, short_name, trained_in
 from quad_swarm.parsing import Parser
 from quad_swarm.robot import files
@@ -92,6 +92,7 @@ def make_parser() -> Parser:
     parser.add_argument(
         "--world", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="fields of the preset"
     )
+    add_limits_argument(parser)
     parser.add_argument("--gym-packages", nargs="+", action="extend", metavar="MODULE", help="modules to import first")
     parser.add_argument(
         "--algo",
@@ -113,6 +114,7 @@ def main(argv: list[str] | None = None) -> int:
     trained = trained_in(load_model(args.model, args.algo))
     preset = args.preset or preset_of({args.model: trained})
     config = make_config(preset, read_assignments("--world", args.world), n_robots=args.n_robots)
+    check_limits(args.limits, config)
     if args.out.exists() and not args.out.is_dir():
         raise ValueError(f"--out {args.out} is a file: choose a folder.")
     written = export(args.model, config, args.out, args.algo)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from quad_swarm.evaluation import export
 from quad_swarm.evaluation.command import COLUMNS, main
 from quad_swarm.plants import remote
 from quad_swarm.plants.base import simulated_vehicles
@@ -108,6 +109,30 @@ def test_a_table_fits_one_hundred_columns_unless_all_are_asked_for(capsys):
     assert all(rule in printed for rule in rules)
 
 
+def test_contact_between_steps_has_a_column_where_it_differs(capsys):
+    flags = ["--policy", "none", "--scenario", "symmetric_swap", "--episodes", "3"]
+    for preset, shown in (("paper", True), ("flight", False)):
+        assert main([*flags, "--preset", preset]) == 0
+        titles = capsys.readouterr().out.splitlines()[0]
+        assert ("any time" in titles) is shown
+        assert "  min. (m)" in titles
+
+
+def test_a_world_is_refused_in_which_robots_would_brake_into_a_wall(capsys, tmp_path):
+    world = ["--preset", "flight-v2", "--n-robots", "2", "--world", "planner.max_speed=1"]
+    flags = [*world, "--policy", "none", "--scenario", "random", "--episodes", "1", "--max-steps", "2"]
+    walls = "room=[[-5.5,-5.5,0],[5.5,5.5,4]]"
+    assert main([*flags, "--limits", walls, "fence=0.05"]) == 1
+    assert "give planner.workspace_low[0]=" in capsys.readouterr().err
+    assert main([*flags, "--limits", walls.replace("5.5", "7"), "fence=0.3"]) == 0
+    out = str(tmp_path / "robots")
+    model = str(pretrained_folder("quad-swarm-flight-v2") / "model.zip")
+    given = [model, *world, "--out", out, "--limits", walls, "fence=0.05"]
+    with pytest.raises(ValueError, match=r"limits\.room: 0\.7 m between"):
+        export.main(given)
+    assert not Path(out).exists()
+
+
 def test_worlds_with_obstacles_have_columns_of_their_own(capsys):
     flags = [
         "--preset",
@@ -125,7 +150,7 @@ def test_worlds_with_obstacles_have_columns_of_their_own(capsys):
     assert main([*flags, "--scenario", "forest", "random"]) == 0
     titles, _, forest, plain = capsys.readouterr().out.partition("\n\n")[0].splitlines()
     assert "  obstacles  " in titles
-    assert "  to obst. (m)  " in titles
+    assert "  obstacle (m)  " in titles
     begin = titles.index("obstacles")
     assert forest[begin : begin + len("obstacles")].strip() == "0.0%"
     assert plain[begin : begin + len("obstacles")].strip() == "-"
