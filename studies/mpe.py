@@ -228,7 +228,7 @@ def report(rows: Sequence[Row]) -> None:
     if found:
         print("\nMADDPG minus another algorithm at the end, Welch's 95 % interval; p by Holm too.")
     for ((env, actions, algo), (difference, half, p)), after in zip(found.items(), corrected, strict=True):
-        print(f"  {env:30} {actions:11} {algo:9} {difference:+.2f} ± {half:.2f}   p = {p:.3f}, corrected {after:.3f}")
+        print(f"  {env:32} {actions:11} {algo:9} {difference:+.2f} ± {half:.2f}   p = {p:.3f}, corrected {after:.3f}")
 
 
 def comparisons(rows: Iterable[Row]) -> dict[tuple[str, str, str], tuple[float, float, float]]:
@@ -342,7 +342,7 @@ def main() -> None:
     parser.add_argument("--log-folder", type=Path, default=Path("logs/mpe2"), help="folder of the trainings")
     parser.add_argument("--json", type=Path, default=ROOT / "studies/data/mpe2.json", metavar="FILE")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the learning curves")
-    parser.add_argument("--report", action="store_true", help="only report finished trainings")
+    parser.add_argument("--report", action="store_true", help="only report what is trained, and what --json has")
     args = parser.parse_args()
 
     folder = args.log_folder.resolve()
@@ -364,14 +364,15 @@ def main() -> None:
                 except RuntimeError as error:
                     failures.append(str(error))
                     print(f"FAILED {error}", flush=True)
-    rows = [row for run in runs if (row := run.row())]
+    finished = [row for run in runs if (row := run.row())]
+    trained = {tuple(row[key] for key in KEYS) for row in finished}
+    known = json.loads(args.json.read_text())["runs"] if args.json.exists() else []
+    rows = [*(row for row in known if tuple(row[key] for key in KEYS) not in trained), *finished]
     if not rows:
         sys.exit("Nothing is finished.")
-    trained = {tuple(row[key] for key in KEYS) for row in rows}
-    known = json.loads(args.json.read_text())["runs"] if args.json.exists() else []
-    rows = [*(row for row in known if tuple(row[key] for key in KEYS) not in trained), *rows]
     report(rows)
-    write(rows, args.json)
+    if finished:
+        write(rows, args.json)
     if args.plot:
         plot(rows, args.plot)
     if len(rows) < len(runs):

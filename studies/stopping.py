@@ -26,17 +26,17 @@ STARTS = np.array([[-20.0, -20.0, 1.5], [-20.0, 20.0, 1.5]])
 GROUND, MOST = 0.1, 60.0  # m, s
 
 
-def measure(vehicle: str, speed: float, wind: float, flights: int) -> list[dict[str, Any]]:
-    """Return a row for a landing that is told, and one for a state that is lost."""
+def measure(vehicle: str, speed: float, wind: float, told: int, lost: int) -> list[dict[str, Any]]:
+    """Return a row for as many landings that are told, and one for as many states that are lost."""
     limits = {"max_speed": speed, "workspace_low": [-40, -40, 0.5], "workspace_high": [40, 40, 4]}
     world = {"quadrotor": vehicle, "planner": limits, "noise": {"wind": wind, "gust": wind / 2}}
     config = make_config("flight-v2", world, n_robots=2)
     flight, rows = VirtualFlight(config, [RulePolicy("none")] * 2), []
-    for lost in (False, True):
-        found = np.array([_fly_on(flight, lost, seed) for seed in range(flights)])
+    for what, flights in (("told", told), ("lost", lost)):
+        found = np.array([_fly_on(flight, what == "lost", seed) for seed in range(flights)])
         speeds, farthest, beside = found.T
         rows.append({
-            "vehicle": vehicle, "max_speed": speed, "wind": wind, "what": "lost" if lost else "told",
+            "vehicle": vehicle, "max_speed": speed, "wind": wind, "what": what,
             "flights": flights, "speed": speeds.max(), "on": farthest.max(), "beside": np.median(beside),
             "beside_most": beside.max(),
         })  # fmt: skip
@@ -65,14 +65,15 @@ def main() -> None:
     """Measure all vehicles, speeds and winds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows")
-    parser.add_argument("--flights", type=int, default=20, help="flights of each (default 20)")
+    parser.add_argument("--told", type=int, default=500, help="landings of each that are told (default 500)")
+    parser.add_argument("--lost", type=int, default=20, help="states of each that are lost (default 20)")
     args = parser.parse_args()
     rows = []
     print("vehicle      limit  wind  what  speed     on  beside (most)")
     for vehicle in VEHICLES:
         for speed in SPEEDS:
             for wind in WINDS:
-                for row in measure(vehicle, speed, wind, args.flights):
+                for row in measure(vehicle, speed, wind, args.told, args.lost):
                     rows.append(row)
                     print(
                         f"{vehicle:12} {speed:5.1f} {wind:5.1f}  {row['what']:4}  {row['speed']:5.2f}  {row['on']:5.2f}"

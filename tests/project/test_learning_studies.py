@@ -73,7 +73,7 @@ def test_comparisons_are_corrected_for_their_number(capsys):
     assert (difference, half, p) == pytest.approx((3.93, 3.75, 0.0431), abs=0.01)
     assert min(mpe.holm([p for _, _, p in found.values()])) > 0.3
     mpe.report(rows)
-    assert "mpe2/simple_speaker_listener_v4 continuous  iddpg     +3.93 ± 3.75" in capsys.readouterr().out
+    assert "mpe2/simple_speaker_listener_v4  continuous  iddpg     +3.93 ± 3.75" in capsys.readouterr().out
 
 
 def test_the_recorded_trainings_and_games_are_printed(capsys):

@@ -91,7 +91,7 @@ def braking_room(config: SwarmConfig, fence: float) -> np.ndarray:
     :param fence: how far outside of the workspace they are noticed (m)
     """
     speed = config.planner.max_speed
-    sideways = 0.4 * speed + 0.1 * speed * speed
+    sideways = 0.5 * speed + 0.1 * speed * speed
     return fence + config.radius + np.array([sideways, sideways, 0.5])
 
 

@@ -229,22 +229,24 @@ def test_limits_in_other_units_are_refused(limits):
 def test_a_robot_that_leaves_the_workspace_stops_before_the_walls():
     slow = make_config("flight", n_robots=3, radius=0.15, planner={"max_speed": 1.0})
     low, high = np.array(slow.planner.workspace_low), np.array(slow.planner.workspace_high)
-    apart = np.array([0.95, 0.95, 0.95])  # 0.3 m, braking from 1 m/s within 0.5 m, and the radius
+    apart = np.array([1.05, 1.05, 0.95])  # 0.3 m, braking from 1 m/s within 0.6 m, upwards 0.5 m, and the radius
 
     def make(fence, less=(0, 0, 0), more=(0, 0, 0), config=slow):
         room = (tuple(low - apart + less), tuple(high + apart - more))
         return Supervisor(config, SafetyLimits(fence=fence, room=room))
 
     make(0.3, less=(0, 0, 9))
-    with pytest.raises(ValueError, match=r"0\.9 m between planner\.workspace_low\[1\]=.* needs 0\.95 m to stop"):
-        make(0.3, less=(0, 0.05, 0))
     with pytest.raises(
-        ValueError, match=r"0\.9 m between planner\.workspace_high\[2\]=.* needs 0\.95 m to stop: [^,]*,"
+        ValueError,
+        match=r"1 m between planner\.workspace_low\[1\]=.* needs 1\.05 m to stop: give planner\.workspace_low\[1\]=",
     ):
+        make(0.3, less=(0, 0.05, 0))
+    upwards = r"0\.9 m between planner\.workspace_high\[2\]=.* the ceiling at .* needs 0\.95 m to stop: give [^,]*, or"
+    with pytest.raises(ValueError, match=upwards):
         make(0.3, more=(0, 0, 0.05))
-    with pytest.raises(ValueError, match=r"the fence \(1 m\) needs 1\.65 m to stop"):
+    with pytest.raises(ValueError, match=r"the fence \(1 m\) needs 1\.75 m to stop"):
         make(1.0)
-    with pytest.raises(ValueError, match=r"needs 1\.65 m to stop.* lower planner\.max_speed=2, or"):
+    with pytest.raises(ValueError, match=r"needs 1\.85 m to stop.* a planner\.max_speed below 2$"):
         make(0.3, config=make_config(slow, {"planner": {"max_speed": 2.0}}))
     with pytest.raises(ValueError, match=r"room"):
         SafetyLimits(room=((0, 0, 0), (1, 1, float("inf"))))

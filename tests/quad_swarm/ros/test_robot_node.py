@@ -365,7 +365,7 @@ def test_real_vehicles_say_how_large_their_room_is(make, monkeypatch):
     for parameters, reason in (
         ({}, "world: give your robots' radius"),
         ({"world": ["radius=0.2"]}, "limits: give the lowest and the highest corner between your walls"),
-        ({"world": ["radius=0.2"], "limits": ["room=[[-5,-5,0],[5,5,3]]"]}, "needs 4.4 m to stop"),
+        ({"world": ["radius=0.2"], "limits": ["room=[[-5,-5,0],[5,5,3]]"]}, "needs 4.8 m to stop"),
     ):
         with pytest.raises(ValueError, match=re.escape(reason)):
             make(**given, **parameters).configure()
