@@ -22,6 +22,7 @@ from quad_swarm.world.scenarios import without_obstacles
 from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import condition, progress
 from studies.swarm.protocol import EARLIER
+from studies.swarm.version2 import CHEAP_RULES, ORCA
 
 NAMES = without_obstacles()[::-1]  # the hardest first
 WORLDS = {"paper": "Four robots (paper)", "dense": "Eight robots (dense)"}
@@ -175,11 +176,10 @@ def draw_flight_fronts(tried: Rows, twelve: Rows, sixteen: Rows, path: Path) -> 
 
 
 @rc_context(STYLE)
-def draw_version_2(sealed: Rows, orca: Rows, tried: Rows, path: Path) -> None:
+def draw_version_2(sealed: Rows, tried: Rows, path: Path) -> None:
     """Draw plans sent against collisions in the symmetric swap of `flight-v2`, with a panel for each number of robots.
 
     :param sealed: rows of `studies.swarm.version2`
-    :param orca: rows of ORCA
     :param tried: rows of rules, and of the packaged model at other thresholds, on validation episodes
     :param path: path of the figure
     """
@@ -208,9 +208,11 @@ def draw_version_2(sealed: Rows, orca: Rows, tried: Rows, path: Path) -> None:
             alpha=0.6,
             label="the packaged model at other thresholds",
         )
-        silent = [row for row in orca if hardest(row, n) and row["preset"] == "flight-v2"]
-        _points(axes, by_policy(silent), "^", COLOURS[2], "ORCA, no messages")
+        silent = [row for row in flown if row["policy"] == ORCA]
+        _points(axes, silent, "^", COLOURS[2], "ORCA, no messages, sealed")
         _points(axes, [row for row in flown if row["policy"] == BEST_RULE], "D", INK, "best rule of version 1, sealed")
+        cheap = [row for row in flown if row["policy"] in CHEAP_RULES]
+        _points(axes, cheap, "d", RULES, "cheaper rules, sealed")
         none = [row for row in flown if row["policy"] == "none"]
         _points(axes, none, "X", RULES, "no communication, sealed")
         learned = [row for row in flown if as_shipped(row["policy"])]

@@ -43,7 +43,7 @@ from studies.swarm.figures import (
 from studies.swarm.fly import PAPERS
 from studies.swarm.protocol import DATA, OF_TEAM, ROOT, best_rules, models
 from studies.swarm.tune_flight import FULL, SWAPS, best_rule
-from studies.swarm.version2 import BRAKING, MASK_ONLY, OWN_MODEL, named
+from studies.swarm.version2 import BOLDER, BRAKING, CHEAP_RULES, MASK_ONLY, ORCA, OWN_MODEL, STRANGE, named
 
 APPENDICES = ("paper_worlds", "swarm_tables", "flight_tables", "teams", "robustness", "asking")
 RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
@@ -273,8 +273,9 @@ def targets(rows: Rows) -> str:
             saved = 1 - pooled(rules)
             safe = sum(row["against_full"]["as_safe"] for row in rules)
             lines.append([f"{preset}, rules", "tuned", f"{safe} of {len(NAMES)}", *["100%"] * 4, f"{saved:.1%}"])
-    head = ["policy", "threshold", "as safe as full in", *(name.replace("_", " ") for name in NAMES)]
-    return table([*head, "fewer than full, pooled"], lines)
+    head = ["policy", "threshold", "within the margin in"]
+    head += [f"{name.replace('_', ' ')}: requests, of the rule's" for name in NAMES]
+    return table([*head, "all scenarios: fewer than full"], lines)
 
 
 def share_of_rule(rows: Rows, row: dict[str, Any]) -> float:
@@ -512,97 +513,115 @@ def headline_table(rows: Rows, best: str) -> str:
     return table([*head, "plans sent, of all possible, all scenarios", "bytes/s a robot sends, all scenarios"], lines)
 
 
-def of_version_2(rows: Rows, orca: Rows, n_robots: int, page: str) -> dict[str, Rows]:
-    """Group the sealed flights of the symmetric swap in `flight-v2` by who sends plans.
+def of_version_2(rows: Rows, n_robots: int, page: str) -> dict[str, Rows]:
+    """Group the sealed flights of the symmetric swap in `flight-v2` by who sends plans, with a row for each policy.
 
-    :param rows: rows of `studies.swarm.version2`; those of several sets are counted together
-    :param orca: rows of ORCA in several presets
+    :param rows: rows of `studies.swarm.version2`; those of several sets, and of training seeds, are counted together
     :param n_robots: number of robots
     :param page: address of the planner's page
     """
     here = [row for row in rows if hardest(row, n_robots) and row["plant"] == MODEL]
     learned = [row for row in here if as_shipped(row["policy"])]
     seeds = len({row["policy"] for row in learned})
-    groups = {
-        "nobody tells anybody": [row for row in here if row["policy"] == "none"],
-        "everybody tells everybody": [row for row in here if row["policy"] == FULL],
-        f"[ORCA]({page}#without-messages-orca-and-voronoi-cells)": [
-            row for row in orca if hardest(row, n_robots) and row["preset"] == "flight-v2"
-        ],
-        f"best of {RULES_TRIED} rules, found in version 1": [row for row in here if row["policy"] == BEST_RULE],
-        "all whom the action mask allows": [row for row in here if row["policy"] == named(MASK_ONLY)],
-        "**learned**" + (f", {seeds} training seeds together" if seeds > 1 else ""): learned,
+    cheap = [row for row in here if row["policy"] in CHEAP_RULES]
+    named_alike = {
+        "nobody tells anybody": "none",
+        "everybody tells everybody": FULL,
+        f"[ORCA]({page}#without-messages-orca-and-voronoi-cells)": ORCA,
+        f"best of {RULES_TRIED} rules, found in version 1": BEST_RULE,
     }
+    groups = {what: [row for row in here if row["policy"] == policy] for what, policy in named_alike.items()}
+    groups[f"{len(CHEAP_RULES)} cheaper rules"] = cheap
+    groups["all whom the action mask allows"] = [row for row in here if row["policy"] == named(MASK_ONLY)]
+    groups["**learned**" + (f", {seeds} training seeds together" if seeds > 1 else "")] = learned
+    groups["learned, at a threshold of 0.5"] = [row for row in here if row["policy"] == named(BOLDER)]
     return {what: chosen for what, chosen in groups.items() if chosen}
 
 
-def glance_table(rows: Rows, orca: Rows, page: str) -> str:
+def counted(what: str, chosen: Rows) -> str:
+    """Format the collisions of a group of `of_version_2`: of different rules, as a range."""
+    return seeds_rate(by_policy(chosen) if what.endswith("rules") else [merged(chosen)])
+
+
+def glance_table(rows: Rows, page: str) -> str:
     """Format the symmetric swap of eight robots in the sealed flights of `flight-v2`: what it is worth, what it costs.
     See `of_version_2`.
 
     :param page: address of the planner's page
     """
-    groups = of_version_2(rows, orca, 8, page)
+    groups = of_version_2(rows, 8, page)
     full = merged(groups["everybody tells everybody"])["steps_to_arrival"]
     lines = []
     for what, chosen in groups.items():
-        each, together = by_policy(chosen), merged(chosen)
+        each = by_policy(chosen)
         sent = sorted(one["request_share"] for one in each)
         later = spread([f"+{time / full - 1:.0%}" for time in sorted(one["steps_to_arrival"] for one in each)])
         if what == "nobody tells anybody":  # only those arrive there that met nobody
             later = "-"
-        elif together["policy"] == FULL:
+        elif chosen[0]["policy"] == FULL:
             later = f"{full * PRESETS['flight-v2'].planner.dt:.1f} s"
-        lines.append([what, seeds_rate([together]), spread([f"{share:.1%}" for share in sent]), later])
+        lines.append([what, counted(what, chosen), spread([f"{share:.1%}" for share in sent]), later])
     return table(["", "flights with a collision", "plans sent", "arrival, beside full"], lines)
 
 
-def version_2_table(rows: Rows, orca: Rows) -> str:
+def version_2_table(rows: Rows) -> str:
     """Format the symmetric swap of eight and sixteen robots in the sealed flights of `flight-v2`, with the sets that
     are counted. See `of_version_2`."""
     lines = []
     for n in (8, 16):
-        for what, chosen in of_version_2(rows, orca, n, "planner.md").items():
+        for what, chosen in of_version_2(rows, n, "planner.md").items():
             each = by_policy(chosen)
             times = sorted(float(one["steps_to_arrival"]) for one in each if one["steps_to_arrival"])
             lines.append(
                 [
                     str(n),
                     what,
-                    seeds_rate([merged(chosen)]).replace("<br>", "&nbsp;"),
+                    counted(what, chosen).replace("<br>", "&nbsp;"),
                     f"{min(row['min_separation_quantiles']['0.01'] for row in chosen):.2f}",
                     spread([f"{share:.1%}" for share in sorted(one["request_share"] for one in each)]),
                     spread([f"{time:.0f}" for time in times]),
-                    ", ".join(map(str, sorted({row.get("set") or row["seed"] for row in chosen}))),
+                    ", ".join(map(str, sorted({row["set"] for row in chosen}))),
                 ]
             )
     return table(["robots", "who sends", "collided", "near (m)", "plans sent", "steps", "sets"], lines)
 
 
 def cells_table(rows: Rows) -> str:
-    """Format the flights of the packaged model of `flight-v2` by scenario and number of robots.
+    """Format the flights of the packaged model of `flight-v2` by scenario and number of robots, and below them those of
+    all training seeds together, if there are others.
 
     :param rows: rows of `studies.swarm.version2`. Flights among obstacles count from the braking reserve on
     """
     flown = [row for row in rows if row["plant"] == MODEL and (row["scenario"] in NAMES or row["set"] >= BRAKING)]
-    cells: dict[tuple[str, int], dict[str, Rows]] = {}
+    cells: dict[tuple[str, int], Rows] = {}
     for row in flown:
-        here = cells.setdefault((row["scenario"], row["n_robots"]), {})
-        here.setdefault(row["policy"], []).append(row)
+        cells.setdefault((row["scenario"], row["n_robots"]), []).append(row)
     sizes = sorted({n for _, n in cells})
     lines = []
     for name in (*NAMES, *MOST_OBSTACLES):
         line, everybody = [name.replace("_", " ")], []
         for n in sizes:
-            own, full = merged(cells[name, n][named(OWN_MODEL)]), merged(cells[name, n][FULL])
-            counts = [one[key] for one in (own, full) for key in ("collisions", "episodes")]
-            sign = "" if newcombe_interval(*counts)[1] < SAFETY_MARGIN else "**"
+            full = merged([row for row in cells[name, n] if row["policy"] == FULL])
+            own = merged([row for row in cells[name, n] if row["policy"] == named(OWN_MODEL)])
+            seeds = [row for row in cells[name, n] if as_shipped(row["policy"])]
             later = f"{own['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%")
-            line.append(f"{sign}{own['collisions']}{sign}; {own['request_share']:.1%}, {later}".replace(" ", "&nbsp;"))
+            text = f"{judged(own, full)}; {own['request_share']:.1%}, {later}"
+            if len(each := by_policy(seeds)) > 1:
+                together = merged(seeds)
+                sent = spread([f"{share:.1%}" for share in sorted(one["request_share"] for one in each)])
+                text += f"<br>*{len(each)} seeds:* {judged(together, full)} of {together['episodes']:,}; {sent}"
+            line.append(text.replace(" ", "&nbsp;"))
             everybody.append(full)
         flights = sum(one["episodes"] for one in everybody)
         lines.append([*line, f"{sum(one['collisions'] for one in everybody)} of {flights:,}".replace(" ", "&nbsp;")])
     return table(["scenario", *(f"{n} robots" for n in sizes), "full, all of these"], lines)
+
+
+def judged(own: dict[str, Any], full: dict[str, Any]) -> str:
+    """Format collisions, bold unless they are within the margin of full communication."""
+    counts = [one[key] for one in (own, full) for key in ("collisions", "episodes")]
+    sign = "" if newcombe_interval(*counts)[1] < SAFETY_MARGIN else "**"
+    return f"{sign}{own['collisions']}{sign}"
 
 
 def obstacles_table(rows: Rows) -> str:
@@ -735,7 +754,9 @@ def main() -> None:
         for name in [*names.split(), "checkpoints", "flight", "flight_tuning", "flight_sixteen_sealed", "flight_world"]
     }
     rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))
-    sealed_2, orca, tried_2 = (read_rows(VERSION_2 / f"{name}.json") for name in ("version2", "orca", "front"))
+    # Those in other disturbances, or with more robots, are no part of the tables
+    sealed_2 = [row for row in read_rows(VERSION_2 / "version2.json") if row["set"] != STRANGE]
+    tried_2 = read_rows(VERSION_2 / "front.json")
     blocks = {
         "targets": targets(test),
         "worse": worse_table(test),
@@ -760,9 +781,9 @@ def main() -> None:
         "counterfactual": reference_table(rows["counterfactual"], "price"),
         "training": training_table(rows["training"]),
         "headline": headline_table(rows["flight"], best_rule()) if rows["flight"] else "Not flown yet.",
-        "glance": glance_table(sealed_2, orca, "docs/planner.md"),
-        "results": glance_table(sealed_2, orca, "planner.md"),
-        "version 2": version_2_table(sealed_2, orca),
+        "glance": glance_table(sealed_2, "docs/planner.md"),
+        "results": glance_table(sealed_2, "planner.md"),
+        "version 2": version_2_table(sealed_2),
         "cells": cells_table(sealed_2),
         "obstacles": obstacles_table(sealed_2),
         "flight": flight_table(rows["flight"]),
@@ -796,7 +817,7 @@ def main() -> None:
         tried = [*rows["flight_tuning"], *read_rows(args.data / "flight_sixteen.json.gz")]
         sealed = rows["flight"], rows["flight_sixteen_sealed"]
         draw_flight_fronts(tried, *sealed, args.images / "front_flight.png")
-    draw_version_2(sealed_2, orca, tried_2, args.images / "front_version_2.png")
+    draw_version_2(sealed_2, tried_2, args.images / "front_version_2.png")
     if flown:
         draw_trajectories(flown, args.images / "flights.png")
     if asking:

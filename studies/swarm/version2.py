@@ -22,15 +22,16 @@ other numbers with the packaged model, ``rule_again`` and ``none_again``, the be
 of each scenario with obstacles and each number of robots; set 715 ``mask``, the packaged model at a threshold at which
 it asks and tells all whom its action mask allows; set 716 ``orca_eight`` and ``orca_sixteen``, and, of what did not
 collide in 200 symmetric swaps of eight robots in ``studies/data/front.json``, the four cheapest rules and the model at
-0.5, ``cheap_eight`` and ``cheap_sixteen``. All parts before set 706 fly with equal penalties, those before set 709
-without the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`;
-written after each row, so that a run that is ended keeps what it has.
+0.5, ``cheap_eight`` and ``cheap_sixteen``; set 717 ``hard``, the packaged model in the disturbances of `flight-hard`,
+and ``many``, with 24 and 32 robots. All parts before set 706 fly with equal penalties, those before set 709 without the
+reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written
+after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,7 +41,7 @@ from quad_swarm.evaluation.evaluation import Rows, fly_all, make_pool, summarise
 from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.rows import aligned, write_rows
 from quad_swarm.plants.base import MODEL
-from quad_swarm.world.presets import make_config
+from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import MOST_OBSTACLES, without_obstacles
 from sb3_maddpg.hub.pretrained import pretrained_folder
 from studies.swarm import delay_check
@@ -50,7 +51,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP = 713, 715, 716
+RESERVE, MASKED, CHEAP, STRANGE = 713, 715, 716, 717
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -70,6 +71,15 @@ CHEAP_RULES = ("plan:1.0s&stale:4", "stage:0.7:0.3", "stage:0.8:0.3", "cpa:1.0s:
 # Of those who do not tell
 ORCA = "orca"
 OTHER_SEEDS = tuple(f"studies/swarm/data/flight_v2_seed{seed}.zip@0.4" for seed in (1, 2, 3, 4))
+# The disturbances of `flight-hard`, which is a world of version 1
+HARD: dict[str, Any] = {
+    name: getattr(PRESETS["flight-hard"], name) for name in ("noise", "sensing", "mismatch", "max_steps")
+} | {
+    "radio": {
+        name: getattr(PRESETS["flight-hard"].radio, name)
+        for name in ("loss", "jitter", "bursts", "burst_length", "outage")
+    }
+}
 EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
 # What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
 CHECKED: dict[str, Any] = {"radio": {"jitter": 0}, "planner": {"commitment": 0.0}}
@@ -88,6 +98,7 @@ class Part(NamedTuple):
     :param set: index of the set of episodes
     :param plant: what flies
     :param vehicle: whose model the planner has, None for the preset's
+    :param changes: further fields of the world
     """
 
     policies: tuple[str, ...]
@@ -97,6 +108,7 @@ class Part(NamedTuple):
     set: int = SEALED
     plant: str = MODEL
     vehicle: str | None = None
+    changes: Mapping[str, Any] = {}
 
 
 PARTS = {
@@ -162,6 +174,8 @@ PARTS = {
     "orca_sixteen": Part((ORCA,), SWAPS, (16,), 2000, CHEAP),
     "cheap_eight": Part((*CHEAP_RULES, BOLDER), SWAPS, (8,), 4000, CHEAP),
     "cheap_sixteen": Part((*CHEAP_RULES, BOLDER), SWAPS, (16,), 1000, CHEAP),
+    "hard": Part(("full", OWN_MODEL), SWAPS, (8,), 1000, STRANGE, changes=HARD),
+    "many": Part(("full", OWN_MODEL), ("random_swap",), (24, 32), 300, STRANGE),
 }
 
 
@@ -172,7 +186,7 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
     """
     count = episodes or part.episodes
     for n in part.n_robots:
-        config = make_config(world("flight-v2", n), plant=part.plant, quadrotor=part.vehicle)
+        config = make_config(world("flight-v2", n), part.changes, plant=part.plant, quadrotor=part.vehicle)
         if part.set < AMONG:
             config = make_config(config, ALIKE)
         if part.set < BRAKING:
@@ -197,7 +211,11 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
                 flown[DELAY_CHECK] = [row for rows in executor.map(fly_piece, pieces) for row in rows]
             for policy, rows in flown.items():
                 keys = {"policy": named(policy), "scenario": scenario, "n_robots": n, "plant": part.plant}
-                yield keys | {"vehicle": part.vehicle, "set": part.set} | summarise(rows, config)
+                yield (
+                    keys
+                    | {"vehicle": part.vehicle, "set": part.set, "hard": part.changes is HARD}
+                    | summarise(rows, config)
+                )
 
 
 def named(policy: str) -> str:

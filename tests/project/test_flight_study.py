@@ -43,8 +43,9 @@ def test_sets_of_episodes_are_apart():
         version2.RESERVE,
         version2.MASKED,
         version2.CHEAP,
+        version2.STRANGE,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 21
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 22
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
@@ -58,8 +59,8 @@ def test_the_table_at_a_glance_says_what_it_costs():
     rows += [row(commitment.BEST_RULE, 2, 0.07, 77.0), row(learned[0], 3, 0.02, 73.5), row(learned[1], 0, 0.01, 77.0)]
     rows += [row(learned[1], 1, 0.02, 77.0), row(learned[1], 99, 0.5, 1.0, scenario="random")]
     rows += [row("full", 99, 1.0, 1.0, plant="rotorpy:hummingbird"), row("full", 99, 1.0, 1.0, n_robots=16)]
-    orca = [row("none", 0, 0.0, 80.5, preset="flight-v2"), row("none", 99, 0.0, 1.0, preset="flight-hard")]
-    text = report.glance_table(rows, orca, "planner.md").replace("&nbsp;", " ").replace("<br>", " ")
+    rows += [row("orca", 0, 0.0, 80.5)]
+    text = report.glance_table(rows, "planner.md").replace("&nbsp;", " ").replace("<br>", " ")
     cells = [line.strip("| ").split(" | ") for line in text.splitlines()[2:]]
     assert [line[1:] for line in cells] == [
         ["1,800 of 2,000 [88.61, 91.24] %", "0.0%", "-"],
@@ -93,7 +94,7 @@ def test_the_tables_of_version_2_count_sets_together_and_judge_cells():
         next(line for line in cells if "forest" in line)
         == "| forest | **2**; 2.0%, +10% | **2**; 2.0%, +10% | 0 of 2,000 |"
     )
-    table = report.version_2_table(rows, []).replace("&nbsp;", " ").splitlines()
+    table = report.version_2_table(rows).replace("&nbsp;", " ").splitlines()
     assert [line.split(" | ")[2:] for line in table[2:4]] == [
         ["0 of 5,000 [0.00, 0.08] %", "0.70", "100.0%", "70", "703, 709 |"],
         ["0 of 2,000 [0.00, 0.19] %", "0.70", "2.0%", "77", "707 |"],
