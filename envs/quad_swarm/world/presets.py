@@ -458,11 +458,11 @@ class SwarmConfig:
         needed, downwash = self._pairwise(least), self.planner.downwash
         i, j, distance = _closest(places * (1, 1, 1 / downwash), needed)
         if distance < needed[i, j]:
-            kept = max(self._pairwise(lambda kind: kind.planner.separation)[i, j], needed[i, j])
+            kept = self._pairwise(lambda kind: kind.planner.separation)[i, j]
             metric = "" if downwash == 1 else f" (vertical distances count 1 / {downwash:g}, planner.downwash)"
             raise ValueError(
                 f"{name}[{i}] and {name}[{j}] are {distance:.3g} m apart{metric}, where {why}: place them at least "
-                f"{kept + self.collision_tolerance:.3g} m apart"
+                f"{max(kept, needed[i, j] + self.collision_tolerance):.3g} m apart"
             )
 
     def _pairwise(self, least: Callable[[SwarmConfig], float]) -> np.ndarray:

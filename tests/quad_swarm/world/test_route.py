@@ -190,7 +190,7 @@ def test_a_goal_too_close_to_that_of_another_robot_or_to_an_obstacle_is_refused(
         swarm.set_goals(0, [STARTS[1] + ASIDE + [0.5, 0, 0]], robots=[0])
     with pytest.raises(ValueError, match=r"goals\[0\]=.* 0 m from the surface of obstacle 0 \(radius 0.3 m, "):
         swarm.set_goals(0, [[0.3, 0, 1]], robots=[0])
-    with pytest.raises(ValueError, match=r"goals\[0\]=.* 0.2 m inside obstacle 0 .* at least 0.299 m from its surf"):
+    with pytest.raises(ValueError, match=r"goals\[0\]=.* 0.2 m inside obstacle 0 .* at least 0.35 m from its surf"):
         swarm.set_goals(0, [[0.1, 0, 1]], robots=[0])
     with pytest.raises(ValueError, match=r"waypoints\[1\]\[0\]=.* from the surface of obstacle 0"):
         swarm.set_goals(0, STARTS, waypoints=[[], [[0.3, 0, 1]]])
