@@ -52,8 +52,6 @@ ALGOS: dict[str, type[TeamAlgorithm]] = {"maddpg": MADDPG, "matd3": MATD3, "masa
 OPPONENTS = {MODULES["simple_tag"], MODULES["simple_adversary"]}
 EVAL_FREQ, EVAL_EPISODES = 10_000, 100
 SHOWN = (50_000, 100_000, 500_000)
-# Mean returns that an implementation should reach, slightly worse than those of XuanCe and a plain PyTorch loop
-BARS = {("simple_spread", 50_000): -21.0, ("simple_spread", 100_000): -19.5}
 PACKAGES = ("sb3-maddpg", "stable-baselines3", "rl_zoo3", "torch", "numpy", "gymnasium", "pettingzoo", "mpe2")
 
 KEYS = ("env", "actions", "algo", "seed")  # identify a run
@@ -213,13 +211,9 @@ def report(rows: Sequence[Row]) -> None:
     print(f"{'environment':32} {'actions':11} {'algorithm':9} {'seeds':>5}" + "".join(f"{at:>24,}" for at in shown))
     for (env, actions, algo), seeds in grouped(rows).items():
         line = f"{env:32} {actions:11} {algo:9} {len(seeds):5}"
-        short = {module: name for name, module in MODULES.items()}[env]
         for at in shown:
             values = [row["mean_return"][row["timesteps"].index(at)] for row in seeds if at in row["timesteps"]]
-            cell = "{:.2f} ± {:.2f}".format(*interval(values)) if values else "-"
-            if values and (bar := BARS.get((short, at))) is not None:
-                cell += f" ({'better' if mean(values) > bar else 'WORSE'} than {bar:g})"
-            line += f"{cell:>24}" if len(cell) < 24 else f"  {cell}"
+            line += f"{'{:.2f} ± {:.2f}'.format(*interval(values)) if values else '-':>24}"
         print(line)
         if last := {name: [row["agents"][name] for row in seeds] for name in seeds[0]["agents"]}:
             print("    at the end: " + ", ".join(f"{name} {mean(values):.2f}" for name, values in last.items()))

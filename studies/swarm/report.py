@@ -561,7 +561,7 @@ def glance_table(rows: Rows, page: str) -> str:
         elif chosen[0]["policy"] == FULL:
             later = f"{full * PRESETS['flight-v2'].planner.dt:.1f} s"
         lines.append([what, counted(what, chosen), spread([f"{share:.1%}" for share in sent]), later])
-    return table(["", "flights with a collision", "plans sent", "arrival, beside full"], lines)
+    return table(["", "flights with a collision", "plans sent", "time to arrival"], lines)
 
 
 def version_2_table(rows: Rows) -> str:
@@ -618,10 +618,9 @@ def cells_table(rows: Rows) -> str:
 
 
 def judged(own: dict[str, Any], full: dict[str, Any]) -> str:
-    """Format collisions, bold unless they are within the margin of full communication."""
+    """Format collisions, with a mark unless they are within the margin of full communication."""
     counts = [one[key] for one in (own, full) for key in ("collisions", "episodes")]
-    sign = "" if newcombe_interval(*counts)[1] < SAFETY_MARGIN else "**"
-    return f"{sign}{own['collisions']}{sign}"
+    return f"{own['collisions']}{'' if newcombe_interval(*counts)[1] < SAFETY_MARGIN else '†'}"
 
 
 def obstacles_table(rows: Rows) -> str:
