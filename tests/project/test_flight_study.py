@@ -91,8 +91,7 @@ def test_the_tables_of_version_2_count_sets_together_and_judge_cells():
     cells = report.cells_table(rows).replace("&nbsp;", " ").splitlines()
     assert cells[2] == "| symmetric swap | 0; 2.0%, +10% | 0; 2.0%, +10% | 0 of 10,000 |"
     assert (
-        next(line for line in cells if "forest" in line)
-        == "| forest | 2†; 2.0%, +10% | 2†; 2.0%, +10% | 0 of 2,000 |"
+        next(line for line in cells if "forest" in line) == "| forest | 2†; 2.0%, +10% | 2†; 2.0%, +10% | 0 of 2,000 |"
     )
     table = report.version_2_table(rows).replace("&nbsp;", " ").splitlines()
     assert [line.split(" | ")[2:] for line in table[2:4]] == [

@@ -27,7 +27,7 @@ from quad_swarm.jobs.journal import default_folder
 from quad_swarm.parsing import Parser
 from quad_swarm.planner import PROBLEMS, SOLVERS, BuildError
 from quad_swarm.plants.base import MODEL, PlantError, simulated_vehicles
-from quad_swarm.realtime.supervisor import SafetyLimits, Supervisor
+from quad_swarm.realtime.supervisor import SafetyLimits, Supervisor, room_of
 from quad_swarm.task.rules import RULES
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_config
@@ -233,7 +233,7 @@ def add_limits_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def check_limits(assignments: Sequence[str], config: SwarmConfig) -> None:
-    """Check that robots may be guarded by limits in a world, see `Supervisor`.
+    """Check that robots may be guarded by limits in a world, see `Supervisor`, and print what their room leaves.
 
     :param assignments: values of ``--limits``
     :raises ValueError: if they are invalid or do not fit the world
@@ -241,6 +241,8 @@ def check_limits(assignments: Sequence[str], config: SwarmConfig) -> None:
     limits = SafetyLimits(**read_assignments("--limits", assignments))
     for robot in range(config.n_robots if assignments else 0):
         Supervisor(config, limits, robot)
+    if limits.room is not None:
+        print(f"room: {room_of(config, limits)}", file=sys.stderr)
 
 
 def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[Condition]:

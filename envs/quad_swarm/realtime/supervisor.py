@@ -16,12 +16,14 @@ from quad_swarm.geometry import flattened, length
 from quad_swarm.quadrotor import N_INPUTS, POSITION, VELOCITY
 from quad_swarm.realtime.link import Sensed, Vehicle, monotonic
 from quad_swarm.validation import checked
+from quad_swarm.world.doubts import warn
 from quad_swarm.world.presets import SwarmConfig
 
 HOVERING = np.zeros(N_INPUTS)
 _US = 1e6
 _AT_REST = 0.01  # m/s, rad
 _GROUND, _DEEPEST = 0.3, 5.0  # heights of the ground in a workspace, and depth below it (m)
+_FAR = 50.0  # distance of a wall from which on it may be meant in other units (m)
 _Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
@@ -49,8 +51,9 @@ class SafetyLimits:
     :param separation: distance to another robot below which it holds its place, in the metric of collisions (see
         `SwarmConfig` for robots of unlike radii and for downwash); None for that of a collision
     :param fence: how far it may leave the workspace to the sides and upwards, before it lands; nothing guards downwards
-    :param room: lowest and highest corner between the walls, in the world's frame; `Supervisor` then checks that a
-        robot which is noticed at the fence stops before the walls and the ceiling. None if there are none
+    :param room: lowest and highest corner between walls, floor and ceiling, in the world's frame; `Supervisor` then
+        checks that the workspace is inside, not on the floor, and that a robot which is noticed at the fence stops
+        before the walls and the ceiling. None if there are none
     :param hung: time without a sign of life of the loop after which the watchdog levels
     :param landing: climb rate of a landing (m/s), negative. Where the planner's limit of descents is lower, robots land
         with that, and may take longer in proportion
@@ -111,23 +114,53 @@ def _check_heights_and_distances(kind: SwarmConfig, config: SwarmConfig, limits:
         )
 
 
+def room_of(config: SwarmConfig, limits: SafetyLimits) -> str:
+    """Describe how much space the room leaves beside the workspace."""
+    assert limits.room is not None
+    (*sides, floor), (*opposite, ceiling) = _gaps(config, limits.room)
+    needed = braking_room(config, limits.fence)
+    return (
+        f"walls {min(*sides, *opposite):.2f} m from the workspace ({needed[0]:.2f} m needed), ceiling {ceiling:.2f} m "
+        f"({needed[2]:.2f} m), floor {floor:.2f} m (nothing guards it)"
+    )
+
+
+def _gaps(config: SwarmConfig, room: tuple[_Corner, _Corner]) -> np.ndarray:
+    """Return the distances of the workspace to the lower and the upper walls, (2, 3) (m)."""
+    planner = config.planner
+    return np.array([np.subtract(planner.workspace_low, room[0]), np.subtract(room[1], planner.workspace_high)])
+
+
 def _check_room(config: SwarmConfig, limits: SafetyLimits) -> None:
     if limits.room is None:
         return
     needed, planner = braking_room(config, limits.fence), config.planner
-    below, above = (np.array(planner.workspace_low) - limits.room[0], limits.room[1] - np.array(planner.workspace_high))
-    below[2] = np.inf  # nothing guards downwards
-    for name, gaps, corner in (("workspace_low", below, 0), ("workspace_high", above, 1)):
-        axis = int((gaps - needed).argmin())
-        if gaps[axis] < needed[axis] - 1e-9:
-            slower = "" if axis == 2 else f", a planner.max_speed below {planner.max_speed:g}"
-            wall, sign = limits.room[corner][axis], 1 - 2 * corner
+    gaps = _gaps(config, limits.room)
+    if gaps.min() < 0:
+        raise ValueError(
+            f"limits.room={[list(corner) for corner in limits.room]}: the workspace, {list(planner.workspace_low)} to "
+            f"{list(planner.workspace_high)}, is not inside; both are in the world's frame, in metres"
+        )
+    if gaps[0, 2] < config.radius:
+        raise ValueError(
+            f"limits.room: {gaps[0, 2]:.3g} m between the floor and planner.workspace_low[2]="
+            f"{planner.workspace_low[2]:g}: nothing guards the floor, and a robot has a radius of {config.radius:g} m"
+        )
+    if gaps.max() > _FAR:
+        warn(f"limits.room is {gaps.max():.3g} m beside the workspace: lengths are in metres")
+    for name, corner in (("workspace_low", 0), ("workspace_high", 1)):
+        least = needed.copy()
+        least[2] = needed[2] if corner else 0.0
+        axis = int((gaps[corner] - least).argmin())
+        gap, wall, sign = gaps[corner, axis], limits.room[corner][axis], 1 - 2 * corner
+        if gap < least[axis] - 1e-9:
             raise ValueError(
-                f"limits.room: {gaps[axis]:.3g} m between planner.{name}[{axis}]={getattr(planner, name)[axis]:g} and "
+                f"limits.room: {gap:.3g} m between planner.{name}[{axis}]={getattr(planner, name)[axis]:g} and "
                 f"the {'ceiling' if axis == 2 else 'wall'} at {wall:g}, but a robot that is noticed at the fence "
                 f"({limits.fence:g} m) needs {needed[axis]:.3g} m to stop: give planner.{name}[{axis}]="
-                f"{round(wall + sign * needed[axis], 3):g}{slower}"
-                + (", or a lower limits.fence" if needed[axis] - limits.fence < gaps[axis] else "")
+                f"{round(wall + sign * needed[axis], 3):g}"
+                + (f", or planner.max_speed below {planner.max_speed:g}" if axis < 2 and gap > limits.fence else "")
+                + (", or a lower limits.fence" if needed[axis] - limits.fence < gap else "")
             )
 
 

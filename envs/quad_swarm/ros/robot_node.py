@@ -44,7 +44,7 @@ from quad_swarm.realtime.attitude import AttitudeController, AttitudeGains
 from quad_swarm.realtime.link import Handler, monotonic
 from quad_swarm.realtime.loop import Loop, freeze_garbage, thaw_garbage
 from quad_swarm.realtime.process import prepare
-from quad_swarm.realtime.supervisor import Mode, SafetyLimits
+from quad_swarm.realtime.supervisor import Mode, SafetyLimits, Supervisor
 from quad_swarm.realtime.team import Team
 from quad_swarm.ros.link import RosLink
 from quad_swarm.ros.messages import FRAME, msgs, to_diagnostics
@@ -70,6 +70,7 @@ from quad_swarm.ros.vehicles import (
     TeamVehicle,
 )
 from quad_swarm.validation import read_assignments
+from quad_swarm.world.obstacles import surroundings
 from quad_swarm.world.presets import REAL_TIME, SwarmConfig, make_config, points
 
 PARAMETERS: dict[str, Any] = {
@@ -94,6 +95,8 @@ PARAMETERS: dict[str, Any] = {
     "gains": [],
     "heading": 0.0,
 }
+# Vehicles that are not simulated
+REAL = ("crazyswarm", "crazyswarm_legacy", "px4", "aerostack")
 _IDLE = 100_000  # us after which a node without a flight looks around
 _STATUS = 1_000_000  # us
 
@@ -141,8 +144,8 @@ def check_walls(world: Sequence[str], limits: Mapping[str, Any]) -> None:
         )
 
 
-def reachable(goal: Any, config: SwarmConfig) -> np.ndarray:
-    """Return a goal that lies in the workspace, (3,) (m).
+def reachable(goal: Any, config: SwarmConfig, robot: int) -> np.ndarray:
+    """Return a goal of a robot that lies in the workspace and beside the obstacles, (3,) (m).
 
     :raises ValueError: if it does not, or is no finite point
     """
@@ -150,6 +153,7 @@ def reachable(goal: Any, config: SwarmConfig) -> np.ndarray:
     low, high = np.array(config.planner.workspace_low), np.array(config.planner.workspace_high)
     if (goal < low).any() or (goal > high).any():
         raise ValueError(f"{goal.tolist()} is outside the workspace, {low.tolist()} to {high.tolist()}")
+    config.check_clear("goal", goal[None], surroundings(config.obstacles.listed), slice(robot, robot + 1))
     return goal
 
 
@@ -284,6 +288,8 @@ class RobotNode:
         )
         standing(config)
         given = read_assignments("limits", texts("limits", values["limits"]))
+        if values["vehicle"] in REAL:
+            check_walls(values["world"], given)
         limits = SafetyLimits(**given)
         team = Team(config, values["policy"], limits, values["wait"], values["late"], priority=values["priority"])
         if index == -1 and (place := self.node.get_namespace().strip("/")) in names:
@@ -301,15 +307,14 @@ class RobotNode:
             )
         if type(values["autostart"]) is not bool:
             raise ValueError(f"autostart={shown(values['autostart'])}: give true or false")
+        Supervisor(config, limits, index)  # what does not fit is told also where the vehicle's messages are missing
         goals = numbers("goal", values["goal"], 3)
         if len(goals) > 1:
             raise ValueError(f"goal={shown(values['goal'])}: give one point")
-        self._goal = reachable(goals[0], config) if len(goals) else None
+        self._goal = reachable(goals[0], config, index) if len(goals) else None
         link = RosLink(self.node, self._mailbox, index, names)
         period = round(config.planner.dt * 1e6)
         vehicle = make_vehicle((self.node, self._mailbox, link, names), values, period)
-        if values["vehicle"] != "odometry":
-            check_walls(values["world"], given)
         self._status = self.node.create_publisher(msgs().DiagnosticArray, f"/{name}/status", quality(5))
         # Goals must arrive; whoever sends one to a robot that does not fly yet is told so by the log
         self._mailbox.subscribe(msgs().PoseStamped, f"/{name}/goal_pose", 10, self._take_goal)
@@ -388,7 +393,7 @@ class RobotNode:
         quaternion = np.array([turned.x, turned.y, turned.z, turned.w])
         if config.turning[loop.robot.index] and quaternion.any():  # who leaves it out asks for no heading
             heading = from_quaternion(quaternion)[2]
-        loop.fly_to(reachable([place.x, place.y, place.z], config), heading=heading)
+        loop.fly_to(reachable([place.x, place.y, place.z], config, loop.robot.index), heading=heading)
 
     def _take_wish(self, request: Any, response: Any) -> Any:
         response.success = self.land()

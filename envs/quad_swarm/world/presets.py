@@ -361,17 +361,14 @@ class SwarmConfig:
             for two robots to be at both
         """
         targets = Targets.of(goals, velocities, waypoints, self.n_robots)
-        tolerance, goal_radius = self.collision_tolerance, self.goal_radius
-        kept = self.per_robot(lambda kind: kind.radius + kind.obstacle_margin)
-        least = self.per_robot(lambda kind: kind.radius + max(kind.obstacle_margin - goal_radius, -tolerance))
-        stands = np.logical_not(around.velocity.any(axis=1))
+        tolerance = self.collision_tolerance
         self._check_inside("goals", targets.goals)
         why = "robots that keep their distance cannot be at both goals"
         self._check_apart("goals", targets.goals, lambda kind: kind.least_spacing - tolerance, why)
         passed = ((f"waypoints[{k}]", one, slice(k, k + 1)) for k, one in enumerate(targets.waypoints))
         for name, one, of in (("goals", targets.goals, slice(None)), *passed):
             self._check_inside(name, one)
-            self._check_clear(name, one, around, least[of], kept[of], "the planner keeps robots away", stands)
+            self.check_clear(name, one, around, of)
         far = [far_goals(kind) for kind in self.kinds]
         legs = zip(self.kind_of, places, targets.waypoints, targets.goals, strict=True)
         doubtful = {
@@ -384,6 +381,21 @@ class SwarmConfig:
         for sentence in fast_goals(self, targets.velocities):
             warn(sentence)
         return targets
+
+    def check_clear(self, name: str, places: np.ndarray, around: Surroundings, robots: slice = slice(None)) -> None:
+        """Check that robots can fly to places beside obstacles that stand.
+
+        :param name: what the places are, for the error
+        :param places: a place for each robot, (n, 3), world frame (m)
+        :param around: obstacles, where they are now
+        :param robots: the robots
+        :raises ValueError: if a robot that keeps its distance to an obstacle does not come within the goal radius
+        """
+        tolerance, reach = self.collision_tolerance, self.goal_radius
+        kept = self.per_robot(lambda kind: kind.radius + kind.obstacle_margin)[robots]
+        least = self.per_robot(lambda kind: kind.radius + max(kind.obstacle_margin - reach, -tolerance))[robots]
+        stands = np.logical_not(around.velocity.any(axis=1))
+        self._check_clear(name, places, around, least, kept, "the planner keeps robots away", stands)
 
     def initial_states(
         self, starts: np.ndarray, goals: np.ndarray, velocities: Any = None, headings: Any = None
@@ -528,17 +540,17 @@ class SwarmConfig:
         smaller = f"{smaller}, or, if walls and ceiling are far enough, " if smaller else ""
         needed = self._assigned({name: found for name, found in tightest.items() if name not in fitting})
         middle = (np.add(low, high) / 2)[:2]
+        if np.abs(middle).max() > (np.subtract(high, low) / 4)[:2].min():
+            raise ValueError(
+                f"planner.workspace_low={low}, planner.workspace_high={high}: starts and goals of {scenario!r} lie "
+                f"around x = y = 0, but the middle of the workspace is {middle.round(3).tolist()}: give a workspace "
+                "around 0, as if the origin of your frame were there (robots may fly in any frame)"
+            )
         raise ValueError(
             f"space.{field}={getattr(self.space, field)}: starts and goals of {scenario!r} lie up to "
             f"{beyond.max():.3g} m outside the workspace; give {smaller}planner.workspace_low={lowest} and "
             f"planner.workspace_high={highest}."
             + (f" Other scenarios need {needed}, too." if needed else "")
-            + (
-                f" Scenarios lie around x = y = 0, but the middle of the workspace is {middle.round(3).tolist()}: move "
-                "the origin of your frame there."
-                if np.abs(middle).max() > (np.subtract(high, low) / 4)[:2].min()
-                else ""
-            )
             + (" Lengths are in metres." if beyond.max() > _FAR_OUTSIDE else "")
         )
 

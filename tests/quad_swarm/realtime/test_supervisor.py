@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from quad_swarm.realtime import Mode, SafetyLimits, Sensed, Supervisor, Watchdog
+from quad_swarm.realtime.supervisor import room_of
+from quad_swarm.world.doubts import DoubtfulWorld
 from quad_swarm.world.presets import make_config
 
 CONFIG = make_config("flight", n_robots=3)
@@ -235,7 +237,7 @@ def test_a_robot_that_leaves_the_workspace_stops_before_the_walls():
         room = (tuple(low - apart + less), tuple(high + apart - more))
         return Supervisor(config, SafetyLimits(fence=fence, room=room))
 
-    make(0.3, less=(0, 0, 9))
+    make(0.3, less=(0, 0, 0.7))
     with pytest.raises(
         ValueError,
         match=r"1 m between planner\.workspace_low\[1\]=.* needs 1\.05 m to stop: give planner\.workspace_low\[1\]=",
@@ -246,10 +248,18 @@ def test_a_robot_that_leaves_the_workspace_stops_before_the_walls():
         make(0.3, more=(0, 0, 0.05))
     with pytest.raises(ValueError, match=r"the fence \(1 m\) needs 1\.75 m to stop"):
         make(1.0)
-    with pytest.raises(ValueError, match=r"needs 1\.85 m to stop.* a planner\.max_speed below 2$"):
+    with pytest.raises(ValueError, match=r"needs 1\.85 m to stop.*, or planner\.max_speed below 2$"):
         make(0.3, config=make_config(slow, {"planner": {"max_speed": 2.0}}))
     with pytest.raises(ValueError, match=r"room"):
         SafetyLimits(room=((0, 0, 0), (1, 1, float("inf"))))
+    with pytest.raises(ValueError, match=r"the workspace, .* is not inside"):
+        Supervisor(slow, SafetyLimits(fence=0.3, room=((0, 0, 0), (12, 12, 4))))
+    with pytest.raises(ValueError, match=r"0\.1 m between the floor and .*: nothing guards the floor"):
+        make(0.3, less=(0, 0, 0.85))
+    with pytest.warns(DoubtfulWorld, match=r"294 m beside the workspace: lengths are in metres"):
+        Supervisor(slow, SafetyLimits(fence=0.3, room=((-300, -300, 0), (300, 300, 260))))
+    limits = SafetyLimits(fence=0.3, room=(tuple(low - apart), tuple(high + apart)))
+    assert room_of(slow, limits).startswith("walls 1.05 m from the workspace (1.05 m needed), ceiling 0.95 m (0.95 m)")
 
 
 def test_a_loop_that_hangs_is_noticed():

@@ -31,6 +31,8 @@ from sb3_maddpg.hub.pretrained import pretrained_folder
 
 ROOT = Path(__file__).parents[3]
 GOOD = {"policy": "full", "names": ["robot_0", "robot_1"], "index": 0}
+PILLAR = "obstacles.listed=[{position: [1, 0, 0], radius: 0.3}]"
+OUTSIDE = {"world": ["radius=0.3"], "limits": ["room=null"]}
 MOVING = "obstacles.listed=[{position: [0, 3, 0], radius: 0.2, velocity: [1, 0, 0]}]"
 
 
@@ -85,14 +87,15 @@ def topics(robot):
         ({"limits": ["stall=2"]}, "stall"),
         ({"vehicle": "crazy"}, "Unknown vehicle 'crazy'"),
         ({"twist": "map"}, "choose 'body' or 'world'"),
-        ({"vehicle": "aerostack"}, "give the largest thrust"),
-        ({"vehicle": "px4", "origins": [0.0, 0.0]}, "origins=[0.0, 0.0]: give finite numbers, 3 for each point"),
-        ({"vehicle": "px4", "origins": [0.0, 0.0, 0.0]}, "each of 2 robots"),
+        ({**OUTSIDE, "vehicle": "aerostack"}, "give the largest thrust"),
+        ({**OUTSIDE, "vehicle": "px4", "origins": [0.0, 0.0]}, "origins=[0.0, 0.0]: give finite numbers, 3 for each"),
+        ({**OUTSIDE, "vehicle": "px4", "origins": [0.0, 0.0, 0.0]}, "each of 2 robots"),
         ({"gains": ["hover_thrust=2"]}, "hover_thrust"),
         ({"heading": "north"}, "heading='north': give a finite number"),
         ({"goal": [0.0, 0.0]}, "goal=[0.0, 0.0]: give finite numbers, 3 for each point"),
         ({"goal": [0.0] * 6}, "give one point"),
         ({"goal": [0.0, 0.0, 90.0]}, "outside the workspace"),
+        ({"world": [PILLAR], "goal": [1.0, 0.2, 1.0]}, "0.1 m inside obstacle 0"),
         ({"autostart": 1}, "autostart=1: give true or false"),
         ({"polcy": "full"}, "Unknown parameter 'polcy'"),
         ({"use_sim_time": True}, "robots fly in real time here"),
@@ -109,7 +112,7 @@ def test_what_is_wrong_is_told_and_nothing_stays(make, wrong, reason):
 
 def test_missing_messages_are_told(make, monkeypatch):
     monkeypatch.setitem(sys.modules, "as2_msgs.msg", None)
-    robot = make(**GOOD, vehicle="aerostack", most_thrust=20.0)
+    robot = make(**GOOD, **OUTSIDE, vehicle="aerostack", most_thrust=20.0)
     before = topics(robot)
     with pytest.raises(ImportError, match="as2_msgs is not there: build it"):
         robot.configure()

@@ -285,6 +285,16 @@ def test_a_room_beyond_a_given_workspace_is_refused_where_it_is_used(name, chang
         ScenarioSampler(other, 4, config.space, config)
 
 
+def test_a_workspace_in_a_corner_of_the_frame_is_told_as_such():
+    planner = {"workspace_low": (0, 0, 0.4), "workspace_high": (6, 6, 2.4)}
+    config = make_config("flight-v2", planner=planner, n_robots=2)
+    with pytest.raises(
+        ValueError, match=r"around x = y = 0, but the middle of the workspace is \[3\.0, 3\.0\]: give"
+    ) as caught:
+        ScenarioSampler("symmetric_swap", 2, config.space, config)
+    assert "workspace_low=[" not in str(caught.value), "a workspace beyond the walls"
+
+
 def _foreign(starts, goals):
     return lambda n_robots, space, rng: (np.array(starts, float), np.array(goals, float))
 
