@@ -256,7 +256,7 @@ def test_a_robot_that_leaves_the_workspace_stops_before_the_walls():
         Supervisor(slow, SafetyLimits(fence=0.3, room=((0, 0, 0), (12, 12, 4))))
     with pytest.raises(ValueError, match=r"0\.1 m between the floor and .*: nothing guards the floor"):
         make(0.3, less=(0, 0, 0.85))
-    with pytest.warns(DoubtfulWorld, match=r"294 m beside the workspace: lengths are in metres"):
+    with pytest.warns(DoubtfulWorld, match=r"295 m beside the workspace: lengths are in metres"):
         Supervisor(slow, SafetyLimits(fence=0.3, room=((-300, -300, 0), (300, 300, 260))))
     limits = SafetyLimits(fence=0.3, room=(tuple(low - apart), tuple(high + apart)))
     assert room_of(slow, limits).startswith("walls 1.05 m from the workspace (1.05 m needed), ceiling 0.95 m (0.95 m)")

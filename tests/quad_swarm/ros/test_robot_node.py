@@ -416,10 +416,11 @@ def test_the_file_of_the_walk_through_configures_a_robot_with_an_exported_policy
     page = (ROOT / "docs" / "ros2.md").read_text()
     (text,) = (block for block in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "ros__parameters" in block)
     parameters = yaml.safe_load(text)["/**"]["ros__parameters"]
-    assert (parameters["vehicle"], parameters["policy"]) == ("crazyswarm", "robots")
+    assert parameters["vehicle"] == "crazyswarm"
     tutorial = (ROOT / "docs" / "tutorials" / "robots.md").read_text()
     (room,) = re.findall(r"ROOM=\((.*?)\)\n", tutorial, re.DOTALL)
-    assert parameters["world"] == shlex.split(room)
+    (pillar,) = re.findall(r"# A pillar: ROOM\+=\((.*?)\)\n", tutorial)
+    assert parameters["world"] == shlex.split(f"{room} {pillar}")
     config = make_config(
         PARAMETERS["preset"],
         read_assignments("world", parameters["world"]),
@@ -428,7 +429,8 @@ def test_the_file_of_the_walk_through_configures_a_robot_with_an_exported_policy
     export(str(pretrained_folder("quad-swarm-flight-v2") / "model.zip"), config, tmp_path / "robots")
     monkeypatch.chdir(tmp_path)
     # Crazyswarm2's messages are no wheel
-    Path("robots.yaml").write_text(text.replace("vehicle: crazyswarm", "vehicle: odometry"))
+    here = text.replace("vehicle: crazyswarm", "vehicle: odometry").replace(parameters["policy"], "robots")
+    Path("robots.yaml").write_text(here)
     node = RobotNode(["robot", "--ros-args", "-r", "__ns:=/cf1", "--params-file", "robots.yaml"])
     try:
         node.configure()
