@@ -8,6 +8,7 @@ import pkgutil
 import re
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 import gymnasium
 
@@ -24,10 +25,16 @@ def register(env_id: str) -> bool:
 
     :param env_id: Gymnasium id
     :return: whether the id is registered now
-    :raises ValueError: if the module exists but cannot be imported, or Gymnasium has no ids of this form
+    :raises ValueError: if it is a path, the module exists but cannot be imported, or Gymnasium has no ids of this form
     """
     if env_id in gymnasium.registry:
         return True
+    if env_id.startswith(("/", "./", "../")) or env_id.endswith(".py"):
+        path = Path(env_id.removesuffix("/parallel_env"))
+        folder = "" if path.parent == Path() else f" in the folder '{path.parent}'"
+        raise InvalidEnvironmentError(
+            f"{shown(env_id)} is a path, but ids are names of modules: use '{path.name.removesuffix('.py')}'{folder}."
+        )
     entry = module_of(env_id)
     if not all(part.isidentifier() for part in entry.split(".")):
         return False

@@ -534,7 +534,7 @@ def of_version_2(rows: Rows, n_robots: int, page: str) -> dict[str, Rows]:
     groups[f"{len(CHEAP_RULES)} cheaper rules"] = cheap
     groups["all whom the action mask allows"] = [row for row in here if row["policy"] == named(MASK_ONLY)]
     groups["**learned**" + (f", {seeds} training seeds together" if seeds > 1 else "")] = learned
-    groups["learned, at a threshold of 0.5"] = [row for row in here if row["policy"] == named(BOLDER)]
+    groups["learned, training seed 0 at a threshold of 0.5"] = [row for row in here if row["policy"] == named(BOLDER)]
     return {what: chosen for what, chosen in groups.items() if chosen}
 
 
@@ -614,7 +614,7 @@ def cells_table(rows: Rows) -> str:
             everybody.append(full)
         flights = sum(one["episodes"] for one in everybody)
         lines.append([*line, f"{sum(one['collisions'] for one in everybody)} of {flights:,}".replace(" ", "&nbsp;")])
-    return table(["scenario", *(f"{n} robots" for n in sizes), "full, all of these"], lines)
+    return table(["scenario", *(f"{n} robots" for n in sizes), "full, all sizes"], lines)
 
 
 def judged(own: dict[str, Any], full: dict[str, Any]) -> str:

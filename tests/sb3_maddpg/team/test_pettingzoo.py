@@ -858,6 +858,8 @@ def test_a_vectorised_environment_is_no_single_one():
 @pytest.mark.parametrize(
     ("env_id", "message"),
     [
+        ("./mine.py", "'./mine.py' is a path, but ids are names of modules: use 'mine'."),
+        ("../lab/mine/parallel_env", "use 'mine' in the folder '../lab'"),
         ("my_envs/x", "no module my_envs.x with a function parallel_env"),
         ("Nowhere-v7", "have to be imported first"),
         ("CartPole-v9", "did you mean 'CartPole-v1'?"),
