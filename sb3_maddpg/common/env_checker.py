@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import gymnasium
@@ -31,6 +32,7 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
     Check that an environment follows the team convention, see ``TeamEnvironment``, ``TeamAttributes`` and ``TeamInfo``.
     Runs Stable-Baselines3's ``check_env``, then checks the spaces, the attributes and an episode of random actions.
     Actions that action masks forbid are replaced by legal ones. Errors that the environment itself raises pass through.
+    Agents that stay in PettingZoo's ``agents`` after the episode cause a warning.
 
     :param env: team environment or PettingZoo environment
     :param max_steps: maximum number of steps of the episode
@@ -175,6 +177,13 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
             if env.has_wrapper_attr("n_curriculum_levels") and "is_success" not in info:
                 raise InvalidEnvironmentError(
                     'CurriculumCallback needs info["is_success"] in the last step of an episode.'
+                )
+            adapter = env.unwrapped
+            if isinstance(adapter, TeamEnv) and (left := adapter.parallel_env.agents):
+                warnings.warn(
+                    f"The episode ended {where}, but `agents` still holds {shown(left)}: PettingZoo's loops, such as "
+                    "`while env.agents`, end when it is empty. Remove agents that have terminated or were truncated.",
+                    stacklevel=3,
                 )
             env.reset()
             kept.check("reset()")

@@ -47,6 +47,20 @@ def unseeded(rng: np.random.Generator, batch: int) -> np.ndarray:
     return np.random.default_rng().uniform(-1, 1, (batch, 3, 3)).astype(np.float32)
 
 
+def test_agents_that_stay_after_the_episode_are_told():
+    env = simple_spread_v3.parallel_env(max_cycles=3)
+    step = env.step
+
+    def stays(actions):
+        returned = step(actions)
+        env.agents = list(env.possible_agents)
+        return returned
+
+    env.step = stays
+    with pytest.warns(UserWarning, match=r"in step 3, but `agents` still holds \['agent_0', 'agent_1', 'agent_2'\]"):
+        check_team_env(env)
+
+
 class Wrong(team_tasks.OwnBit):
     """``info`` of a step is spoilt."""
 
