@@ -241,6 +241,8 @@ def check_limits(assignments: Sequence[str], config: SwarmConfig) -> None:
     limits = SafetyLimits(**read_assignments("--limits", assignments))
     for robot in range(config.n_robots if assignments else 0):
         Supervisor(config, limits, robot)
+    if assignments and limits.room is None:
+        raise ValueError("--limits: give room=[[xlow,ylow,zlow],[xhigh,yhigh,zhigh]], your walls, floor and ceiling.")
     if limits.room is not None:
         print(f"room: {room_of(config, limits)}", file=sys.stderr)
 

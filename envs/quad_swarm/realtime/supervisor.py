@@ -139,7 +139,8 @@ def _check_room(config: SwarmConfig, limits: SafetyLimits) -> None:
     if gaps.min() < 0:
         raise ValueError(
             f"limits.room={[list(corner) for corner in limits.room]}: the workspace, {list(planner.workspace_low)} to "
-            f"{list(planner.workspace_high)}, is not inside; both are in the world's frame, in metres"
+            f"{list(planner.workspace_high)}, is not inside; give the lower corner first, in the world's "
+            "frame, in metres"
         )
     if gaps[0, 2] < config.radius:
         raise ValueError(
@@ -148,20 +149,21 @@ def _check_room(config: SwarmConfig, limits: SafetyLimits) -> None:
         )
     if gaps.max() > _FAR:
         warn(f"limits.room is {gaps.max():.3g} m beside the workspace: lengths are in metres")
-    for name, corner in (("workspace_low", 0), ("workspace_high", 1)):
-        least = needed.copy()
-        least[2] = needed[2] if corner else 0.0
-        axis = int((gaps[corner] - least).argmin())
-        gap, wall, sign = gaps[corner, axis], limits.room[corner][axis], 1 - 2 * corner
-        if gap < least[axis] - 1e-9:
-            raise ValueError(
-                f"limits.room: {gap:.3g} m between planner.{name}[{axis}]={getattr(planner, name)[axis]:g} and "
-                f"the {'ceiling' if axis == 2 else 'wall'} at {wall:g}, but a robot that is noticed at the fence "
-                f"({limits.fence:g} m) needs {needed[axis]:.3g} m to stop: give planner.{name}[{axis}]="
-                f"{round(wall + sign * needed[axis], 3):g}"
-                + (f", or planner.max_speed below {planner.max_speed:g}" if axis < 2 and gap > limits.fence else "")
-                + (", or a lower limits.fence" if needed[axis] - limits.fence < gap else "")
-            )
+    least = np.array([needed, needed])
+    least[0, 2] = 0.0
+    if (gaps < least - 1e-9).any():
+        corner, axis = np.unravel_index((gaps - least).argmin(), gaps.shape)
+        gap, name = gaps[corner, axis], ("workspace_low", "workspace_high")[corner]
+        low = np.maximum(planner.workspace_low, np.add(limits.room[0], least[0])).round(3).tolist()
+        high = np.minimum(planner.workspace_high, np.subtract(limits.room[1], least[1])).round(3).tolist()
+        raise ValueError(
+            f"limits.room: {gap:.3g} m between planner.{name}[{axis}]={getattr(planner, name)[axis]:g} and the "
+            f"{'ceiling' if axis == 2 else 'wall'} at {limits.room[corner][axis]:g}, but a robot that is noticed at "
+            f"the fence ({limits.fence:g} m) needs {needed[axis]:.3g} m to stop: give planner.workspace_low={low} and "
+            f"planner.workspace_high={high}"
+            + (f", or planner.max_speed below {planner.max_speed:g}" if axis < 2 and gap > limits.fence else "")
+            + (", or a lower limits.fence" if needed[axis] - limits.fence < gap else "")
+        )
 
 
 class Supervisor:

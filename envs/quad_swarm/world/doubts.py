@@ -32,6 +32,7 @@ _UNITS = {"vel": "m/s", "attitude": "rad"}
 _FASTEST_TURN = 4 * math.pi  # of the yaw (rad/s)
 _LEAST_MARGIN = 0.05  # between robots beyond contact; in `flight`, with 0.04 some touch (m)
 _HIGH = 120.0  # as high as drones usually may fly (m)
+_HASTY, _GENTLE = 3.0, 4.0  # time to the speed limit, in time constants of the attitude
 _CRUISE = 1.5  # how far robots at full speed aim, in distances that they fly within the horizon
 
 
@@ -232,6 +233,7 @@ def doubts(config: SwarmConfig) -> Iterator[str]:
     short = short_horizon(config)
     if short is None:
         yield from _doubts_about_arriving(config)
+        yield from _doubts_about_hasty_tilts(config)
     else:
         yield short
     yield from _doubts_about_the_vehicle(config)
@@ -276,6 +278,23 @@ def _doubts_about_the_vehicle(config: SwarmConfig) -> Iterator[str]:
             f"planner.max_yaw_rate={planner.max_yaw_rate:g} is in rad/s and more than two turns per second: "
             f"{math.radians(planner.max_yaw_rate):.3g} would be the same number in degrees"
         )
+
+
+def _doubts_about_hasty_tilts(config: SwarmConfig) -> Iterator[str]:
+    """Yield a sentence if robots reach their speed limit before their attitude follows: the planner then tilts them to
+    and fro, and vehicles whose attitude overshoots tumble (a Crazyflie with brushed motors in Crazyflow, at 1 m/s)."""
+    planner, vehicle = config.planner, config.quadrotor
+    lag = max(vehicle.roll_time_constant, vehicle.pitch_time_constant)
+    for axis in axes(planner, vehicle):
+        thrust = axis.gravity * math.tan(min(axis.gain * axis.max_tilt, 1.5))
+        gentle = math.floor(100 * math.atan(planner.max_speed / (_GENTLE * lag * axis.gravity)) / axis.gain) / 100
+        if planner.max_speed < _HASTY * lag * thrust and gentle > 0:
+            yield (
+                f"planner.max_speed={planner.max_speed:g}: with planner.max_tilt={planner.max_tilt:.3g}, robots reach "
+                f"it in {planner.max_speed / thrust:.2g} s, hardly more than their attitude takes ({lag:.2g} s): they "
+                f"tilt to and fro, and some vehicles tumble; use planner.max_tilt={gentle:g}"
+            )
+            return
 
 
 def _doubts_about_arriving(config: SwarmConfig) -> Iterator[str]:

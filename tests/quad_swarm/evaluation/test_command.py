@@ -123,8 +123,11 @@ def test_a_world_is_refused_in_which_robots_would_brake_into_a_wall(capsys, tmp_
     flags = [*world, "--policy", "none", "--scenario", "random", "--episodes", "1", "--max-steps", "2"]
     walls = "room=[[-5.5,-5.5,0],[5.5,5.5,4]]"
     assert main([*flags, "--limits", walls, "fence=0.05"]) == 1
-    assert "give planner.workspace_low[0]=" in capsys.readouterr().err
+    assert "give planner.workspace_low=[" in capsys.readouterr().err
+    assert main([*flags, "--limits", "fence=0.3"]) == 1
+    assert "give room=[[xlow" in capsys.readouterr().err
     assert main([*flags, "--limits", walls.replace("5.5", "7"), "fence=0.3"]) == 0
+    assert "room: walls 2.20 m from the workspace" in capsys.readouterr().err
     out = str(tmp_path / "robots")
     model = str(pretrained_folder("quad-swarm-flight-v2") / "model.zip")
     given = [model, *world, "--out", out, "--limits", walls, "fence=0.05"]
