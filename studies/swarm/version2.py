@@ -23,9 +23,11 @@ of each scenario with obstacles and each number of robots; set 715 ``mask``, the
 it asks and tells all whom its action mask allows; set 716 ``orca_eight`` and ``orca_sixteen``, and, of what did not
 collide in 200 symmetric swaps of eight robots in ``studies/data/front.json``, the four cheapest rules and the model at
 0.5, ``cheap_eight`` and ``cheap_sixteen``; set 717 ``hard``, the packaged model in the disturbances of `flight-hard`,
-and ``many``, with 24 and 32 robots. All parts before set 706 fly with equal penalties, those before set 709 without the
-reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written
-after each row, so that a run that is ended keeps what it has.
+and ``many``, with 24 and 32 robots; set 718 ``bold_four``, ``bold_eight``, ``bold_twelve`` and ``bold_sixteen``, the
+packaged model at 0.5 everywhere, after set 716 had shown that cheap rules are not safe with sixteen robots where this
+threshold is. All parts before set 706 fly with equal penalties, those before set 709 without the reserve, as they did.
+JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a
+run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE = 713, 715, 716, 717
+RESERVE, MASKED, CHEAP, STRANGE, BOLD = 713, 715, 716, 717, 718
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -174,6 +176,10 @@ PARTS = {
     "orca_sixteen": Part((ORCA,), SWAPS, (16,), 2000, CHEAP),
     "cheap_eight": Part((*CHEAP_RULES, BOLDER), SWAPS, (8,), 4000, CHEAP),
     "cheap_sixteen": Part((*CHEAP_RULES, BOLDER), SWAPS, (16,), 1000, CHEAP),
+    "bold_four": Part((BOLDER,), EVERYWHERE, (4,), 2000, BOLD),
+    "bold_eight": Part((BOLDER,), EVERYWHERE, (8,), 2000, BOLD),
+    "bold_twelve": Part((BOLDER,), EVERYWHERE, (12,), 2000, BOLD),
+    "bold_sixteen": Part((BOLDER,), EVERYWHERE, (16,), 2000, BOLD),
     "hard": Part(("full", OWN_MODEL), SWAPS, (8,), 1000, STRANGE, changes=HARD),
     "many": Part(("full", OWN_MODEL), ("random_swap",), (24, 32), 300, STRANGE),
 }
