@@ -229,7 +229,7 @@ def test_episodes_may_last_for_ever(way):
 
 
 def test_a_vehicle_tumbles_whose_planner_tilts_it_faster_than_it_follows():
-    pytest.importorskip("crazyflow")
+    pytest.importorskip("mujoco", reason="the extra `plants` is not installed")
     # What `identify --plant crazyflow:cf2x_L250` finds
     brushed = {"drag_x": 0.458, "drag_y": 0.458, "roll_gain": 1.005, "pitch_gain": 1.005, "climb_gain": 0.911}
     brushed |= {"roll_time_constant": 0.1445, "pitch_time_constant": 0.1445, "climb_time_constant": 0.3388}
