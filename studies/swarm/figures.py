@@ -22,7 +22,7 @@ from quad_swarm.world.scenarios import without_obstacles
 from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import condition, progress
 from studies.swarm.protocol import EARLIER
-from studies.swarm.version2 import CHEAP_RULES, ORCA
+from studies.swarm.version2 import BOLDER, CHEAP_RULES, ORCA, named
 
 NAMES = without_obstacles()[::-1]  # the hardest first
 WORLDS = {"paper": "Four robots (paper)", "dense": "Eight robots (dense)"}
@@ -217,6 +217,8 @@ def draw_version_2(sealed: Rows, tried: Rows, path: Path) -> None:
         _points(axes, none, "X", RULES, "no communication, sealed")
         learned = [row for row in flown if as_shipped(row["policy"])]
         _points(axes, learned, "*", LEARNED, "learned, a mark for each training seed, sealed")
+        bold = [row for row in flown if row["policy"] == named(BOLDER)]
+        _points(axes, bold, "*", LEARNED, "one of them at a threshold of 0.5, sealed", hollow=True)
         full = [row for row in flown if row["policy"] == "full"]
         _points(axes, full, "s", COLOURS[0], "full communication, sealed")
         axes.set_title(f"{'Eight' if n == 8 else 'Sixteen'} robots, symmetric swap")
