@@ -523,24 +523,18 @@ def of_version_2(rows: Rows, n_robots: int, page: str) -> dict[str, Rows]:
     here = [row for row in rows if hardest(row, n_robots) and row["plant"] == MODEL]
     learned = [row for row in here if as_shipped(row["policy"])]
     seeds = len({row["policy"] for row in learned})
-    cheap = [row for row in here if row["policy"] in CHEAP_RULES]
     named_alike = {
         "nobody tells anybody": "none",
         "everybody tells everybody": FULL,
         f"[ORCA]({page}#without-messages-orca-and-voronoi-cells)": ORCA,
         f"best of {RULES_TRIED} rules, found in version 1": BEST_RULE,
     }
+    named_alike |= {f"`{rule}`": rule for rule in CHEAP_RULES}
     groups = {what: [row for row in here if row["policy"] == policy] for what, policy in named_alike.items()}
-    groups[f"{len(CHEAP_RULES)} cheaper rules"] = cheap
     groups["all whom the action mask allows"] = [row for row in here if row["policy"] == named(MASK_ONLY)]
     groups["**learned**" + (f", {seeds} training seeds together" if seeds > 1 else "")] = learned
     groups["learned, training seed 0 at a threshold of 0.5"] = [row for row in here if row["policy"] == named(BOLDER)]
     return {what: chosen for what, chosen in groups.items() if chosen}
-
-
-def counted(what: str, chosen: Rows) -> str:
-    """Format the collisions of a group of `of_version_2`: of different rules, as a range."""
-    return seeds_rate(by_policy(chosen) if what.endswith("rules") else [merged(chosen)])
 
 
 def glance_table(rows: Rows, page: str) -> str:
@@ -560,7 +554,7 @@ def glance_table(rows: Rows, page: str) -> str:
             later = "-"
         elif chosen[0]["policy"] == FULL:
             later = f"{full * PRESETS['flight-v2'].planner.dt:.1f} s"
-        lines.append([what, counted(what, chosen), spread([f"{share:.1%}" for share in sent]), later])
+        lines.append([what, seeds_rate([merged(chosen)]), spread([f"{share:.1%}" for share in sent]), later])
     return table(["", "flights with a collision", "plans sent", "time to arrival"], lines)
 
 
@@ -576,7 +570,7 @@ def version_2_table(rows: Rows) -> str:
                 [
                     str(n),
                     what,
-                    counted(what, chosen).replace("<br>", "&nbsp;"),
+                    seeds_rate([merged(chosen)]).replace("<br>", "&nbsp;"),
                     f"{min(row['min_separation_quantiles']['0.01'] for row in chosen):.2f}",
                     spread([f"{share:.1%}" for share in sorted(one["request_share"] for one in each)]),
                     spread([f"{time:.0f}" for time in times]),
