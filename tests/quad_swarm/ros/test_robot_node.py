@@ -420,7 +420,7 @@ def test_the_file_of_the_walk_through_configures_a_robot_with_an_exported_policy
     tutorial = (ROOT / "docs" / "tutorials" / "robots.md").read_text()
     (room,) = re.findall(r"ROOM=\((.*?)\)\n", tutorial, re.DOTALL)
     (pillar,) = re.findall(r"# A pillar: ROOM\+=\((.*?)\)\n", tutorial)
-    assert parameters["world"] == shlex.split(f"{room} {pillar}")
+    assert sorted(parameters["world"]) == sorted([*shlex.split(f"{room} {pillar}"), "planner.downwash=3"])
     config = make_config(
         PARAMETERS["preset"],
         read_assignments("world", parameters["world"]),
@@ -429,7 +429,7 @@ def test_the_file_of_the_walk_through_configures_a_robot_with_an_exported_policy
     export(str(pretrained_folder("quad-swarm-flight-v2") / "model.zip"), config, tmp_path / "robots")
     monkeypatch.chdir(tmp_path)
     # Crazyswarm2's messages are no wheel
-    here = text.replace("vehicle: crazyswarm", "vehicle: odometry").replace(parameters["policy"], "robots")
+    here = text.replace("vehicle: crazyswarm", "vehicle: odometry").replace("policy: full", "policy: robots")
     Path("robots.yaml").write_text(here)
     node = RobotNode(["robot", "--ros-args", "-r", "__ns:=/cf1", "--params-file", "robots.yaml"])
     try:
