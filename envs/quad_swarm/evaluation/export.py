@@ -110,9 +110,7 @@ def main(argv: list[str] | None = None) -> int:
     for name in args.gym_packages or ():  # `sb3-maddpg` has imported them before
         importlib.import_module(name)
     if not is_model(args.model):
-        raise ValueError(
-            f"{shown(args.model)} is no model: pass the path of a .zip, latest:LOGDIR or pretrained:NAME. Rules need no file."
-        )
+        raise ValueError(f"{shown(args.model)} is no model: pass the path of a .zip, latest:LOGDIR or pretrained:NAME.")
     trained = trained_in(load_model(args.model, args.algo))
     preset = args.preset or preset_of({args.model: trained})
     config = make_config(preset, read_assignments("--world", args.world), n_robots=args.n_robots)
