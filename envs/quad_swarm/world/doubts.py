@@ -281,8 +281,9 @@ def _doubts_about_the_vehicle(config: SwarmConfig) -> Iterator[str]:
 
 
 def _doubts_about_hasty_tilts(config: SwarmConfig) -> Iterator[str]:
-    """Yield a sentence if robots reach their speed limit before their attitude follows: the planner then tilts them to
-    and fro, and vehicles whose attitude overshoots tumble (a Crazyflie with brushed motors in Crazyflow, at 1 m/s)."""
+    """Yield a sentence if robots reach their speed limit before their attitude follows: the planner then tilts them
+    back and forth, and vehicles whose attitude overshoots tumble (a Crazyflie with brushed motors in Crazyflow, at 1
+    m/s)."""
     planner, vehicle = config.planner, config.quadrotor
     lag = max(vehicle.roll_time_constant, vehicle.pitch_time_constant)
     for axis in axes(planner, vehicle):
@@ -292,7 +293,7 @@ def _doubts_about_hasty_tilts(config: SwarmConfig) -> Iterator[str]:
             yield (
                 f"planner.max_speed={planner.max_speed:g}: with planner.max_tilt={planner.max_tilt:.3g}, robots reach "
                 f"it in {planner.max_speed / thrust:.2g} s, hardly more than their attitude takes ({lag:.2g} s): they "
-                f"tilt to and fro, and some vehicles tumble; use planner.max_tilt={gentle:g}"
+                f"tilt back and forth, and some vehicles tumble; use planner.max_tilt={gentle:g}"
             )
             return
 
