@@ -25,9 +25,9 @@ collide in 200 symmetric swaps of eight robots in ``studies/data/front.json``, t
 0.5, ``cheap_eight`` and ``cheap_sixteen``; set 717 ``hard``, the packaged model in the disturbances of `flight-hard`,
 and ``many``, with 24 and 32 robots; set 718 ``bold_four``, ``bold_eight``, ``bold_twelve`` and ``bold_sixteen``, the
 packaged model at 0.5 everywhere, after set 716 had shown that cheap rules are not safe with sixteen robots where this
-threshold is. All parts before set 706 fly with equal penalties, those before set 709 without the reserve, as they did.
-JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a
-run that is ended keeps what it has.
+threshold is; set 719 ``lacking_eight``, what full communication of eight lacks of 12,000. All parts before set 706 fly
+with equal penalties, those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and
+number of robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD = 713, 715, 716, 717, 718
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING = 713, 715, 716, 717, 718, 719
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -180,6 +180,7 @@ PARTS = {
     "bold_eight": Part((BOLDER,), EVERYWHERE, (8,), 2000, BOLD),
     "bold_twelve": Part((BOLDER,), EVERYWHERE, (12,), 2000, BOLD),
     "bold_sixteen": Part((BOLDER,), EVERYWHERE, (16,), 2000, BOLD),
+    "lacking_eight": Part(("full",), tuple(without_obstacles()), (8,), 2000, LACKING),
     "hard": Part(("full", OWN_MODEL), SWAPS, (8,), 1000, STRANGE, changes=HARD),
     "many": Part(("full", OWN_MODEL), ("random_swap",), (24, 32), 300, STRANGE),
 }
