@@ -68,6 +68,28 @@ inline void steady(const double* pos, const double* vel, const std::vector<doubl
     for (int i = 0; i < 3; i++) to[k + i] = vel[i] * times[k + i] + pos[i];
 }
 
+// A layer of a network: its biases, then a row of weights for each input. Returns where the next layer's weights are.
+const float* layer(const float* weights, const float* in, Integer n_in, Integer n_out, bool rectified, float* out) {
+  constexpr Integer block = 16;  // fits into registers
+  for (Integer first = 0; first < n_out; first += block) {
+    const Integer count = std::min(block, n_out - first);
+    float sums[block] = {};
+    if (count == block) {
+      for (Integer k = 0; k < block; k++) sums[k] = weights[first + k];
+      for (Integer i = 0; i < n_in; i++) {
+        const float* row = weights + (i + 1) * n_out + first;
+        for (Integer k = 0; k < block; k++) sums[k] += in[i] * row[k];
+      }
+    } else {
+      for (Integer k = 0; k < count; k++) sums[k] = weights[first + k];
+      for (Integer i = 0; i < n_in; i++)
+        for (Integer k = 0; k < count; k++) sums[k] += in[i] * weights[(i + 1) * n_out + first + k];
+    }
+    for (Integer k = 0; k < count; k++) out[first + k] = rectified ? std::max(sums[k], 0.0f) : sums[k];
+  }
+  return weights + (n_in + 1) * n_out;
+}
+
 // The record of `STATISTICS` in table.py
 struct Statistics {
   Integer steps, steps_counted, requests, possible_requests, peak_requests, plans_used, plan_ages, requests_flown;
@@ -377,5 +399,82 @@ EXPORT void quad_swarm_count(Integer n_swarms, Integer n_robots, Integer n_slots
     sum.min_separation = std::min(sum.min_separation, min_separation[swarm]);
     sum.min_separation_continuous = std::min(sum.min_separation_continuous, min_separation_continuous[swarm]);
     sum.solve_seconds += seconds / static_cast<double>(n_swarms);
+  }
+}
+
+EXPORT void quad_swarm_anticipate(Integer n_swarms, Integer n_robots, Integer n_bodies, Integer n_targets,
+                                  Integer n_obstacles, Integer n_stages, Integer hidden, Integer width, double dt,
+                                  const float* weights, const double* pos, const double* vel, const Integer* place,
+                                  const double* changes, const Flag* skipped, const double* centres,
+                                  const double* velocities, const double* factors, const double* radius,
+                                  double* expected) {
+  std::vector<float> first(hidden), second(hidden), head(8 + 2 * hidden), one(width), two(width), out(3 * n_stages);
+  for (Integer target = 0; target < n_swarms * n_robots * n_targets; target++) {
+    const Integer view = target / n_targets, swarm = view / n_robots;
+    const Integer self = place[view % n_robots * n_targets + target % n_targets];
+    const double *where = pos + 3 * (view * n_bodies + self), *way = vel + 3 * (view * n_bodies + self);
+    double* to = expected + 3 * (n_stages + 1) * target;
+    if (skipped[target]) {
+      for (Integer k = 0; k <= n_stages; k++)
+        for (int i = 0; i < 3; i++) to[3 * k + i] = where[i] + dt * static_cast<double>(k) * way[i];
+      continue;
+    }
+    const double speed = std::sqrt(way[0] * way[0] + way[1] * way[1]);
+    const bool moves = speed > 1e-3;
+    const double c = moves ? way[0] / speed : 1.0, s = moves ? way[1] / speed : 0.0;
+    std::fill(head.begin(), head.end(), 0.0f);
+    const double *recent = changes + 6 * target, *earlier = recent + 3;
+    const double own[8] = {speed, way[2],
+                           5 * (c * recent[0] + s * recent[1]), 5 * (c * recent[1] - s * recent[0]), 5 * recent[2],
+                           3 * (c * earlier[0] + s * earlier[1]), 3 * (c * earlier[1] - s * earlier[0]), 3 * earlier[2]};
+    for (int i = 0; i < 8; i++) head[i] = static_cast<float>(own[i]);
+    const float* after = weights;
+    for (Integer body = 0; body < n_bodies + n_obstacles; body++) {
+      if (body == self) continue;
+      double away[3], relative[3], shrunk = 1.0;
+      const bool robot = body < n_bodies;
+      if (robot) {
+        const Integer other = 3 * (view * n_bodies + body);
+        for (int i = 0; i < 3; i++) away[i] = pos[other + i] - where[i], relative[i] = vel[other + i] - way[i];
+      } else {
+        const Integer other = swarm * n_obstacles + body - n_bodies;
+        if (!(radius[other] > 0)) continue;
+        for (int i = 0; i < 3; i++) {
+          away[i] = factors[3 * other + i] * (centres[3 * other + i] - where[i]);
+          relative[i] = factors[3 * other + i] * (velocities[3 * other + i] - way[i]);
+        }
+        const double apart = std::sqrt(dot(away, away));
+        shrunk = std::max(1.0 - (radius[other] - 0.3) / std::max(apart, 1e-6), 0.1);
+      }
+      const double near = clipped(6.0 - std::sqrt(dot(away, away)));
+      if (!(near > 0)) continue;
+      for (int i = 0; i < 3; i++) away[i] *= shrunk;
+      const float in[7] = {static_cast<float>((c * away[0] + s * away[1]) / 3),
+                           static_cast<float>((c * away[1] - s * away[0]) / 3),
+                           static_cast<float>(away[2] / 3),
+                           static_cast<float>((c * relative[0] + s * relative[1]) / 4),
+                           static_cast<float>((c * relative[1] - s * relative[0]) / 4),
+                           static_cast<float>(relative[2] / 4),
+                           robot ? 0.0f : 1.0f};
+      layer(layer(weights, in, 7, hidden, true, first.data()), first.data(), hidden, hidden, true, second.data());
+      const float weight = static_cast<float>(near);
+      for (Integer k = 0; k < hidden; k++) {
+        const float value = weight * second[k];
+        head[8 + k] += value;
+        head[8 + hidden + k] = std::max(head[8 + hidden + k], value);
+      }
+    }
+    after += 8 * hidden + (hidden + 1) * hidden;
+    after = layer(after, head.data(), 8 + 2 * hidden, width, true, one.data());
+    after = layer(after, one.data(), width, width, true, two.data());
+    layer(after, two.data(), width, 3 * n_stages, false, out.data());
+    std::copy(where, where + 3, to);
+    for (Integer k = 0; k < n_stages; k++) {
+      const double time = dt * static_cast<double>(k + 1);
+      const double x = out[3 * k], y = out[3 * k + 1], z = out[3 * k + 2];
+      to[3 * k + 3] = where[0] + time * (way[0] + (c * x - s * y));
+      to[3 * k + 4] = where[1] + time * (way[1] + (s * x + c * y));
+      to[3 * k + 5] = where[2] + time * (way[2] + z);
+    }
   }
 }

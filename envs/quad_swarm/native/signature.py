@@ -19,7 +19,12 @@ from typing import Any
 
 import numpy as np
 
-_TYPES = {"f8": np.dtype(np.float64), "i8": np.dtype(np.int64), "bool": np.dtype(np.bool_)}
+_TYPES: dict[str, np.dtype[Any]] = {
+    "f8": np.dtype(np.float64),
+    "f4": np.dtype(np.float32),
+    "i8": np.dtype(np.int64),
+    "bool": np.dtype(np.bool_),
+}
 _SCALARS = {"int": ctypes.c_int64, "real": ctypes.c_double}
 _MOST_CHECKED = 4096  # combinations of shapes that are kept per function
 

@@ -28,7 +28,7 @@ STATISTICS = np.dtype(
 )
 
 # E: swarms, n or R: robots, m or M: the others of a robot, P: pairs, N: stages of a plan, K: some of them, A: answers,
-# S: sub-steps, O: obstacles
+# S: sub-steps or weights, O: obstacles, K: also bodies in sight, T: those of them to predict
 _REMEMBER = Signature(
     "quad_swarm_remember",
     "P N",
@@ -151,6 +151,24 @@ def _measure(pairs: str) -> Signature:
     )
 
 
+_ANTICIPATE = Signature(
+    "quad_swarm_anticipate",
+    "E n K T O N",
+    hidden="int",
+    width="int",
+    dt="real",
+    weights="S f4",
+    pos="E n K 3 f8",
+    vel="E n K 3 f8",
+    place="n T i8",
+    changes="E n T 2 3 f8",
+    skipped="E n T bool",
+    centres="E O 3 f8",
+    velocities="E O 3 f8",
+    factors="E O 3 f8",
+    radius="E O f8",
+    expected="E n T N+1 3 f8 out",
+)
 _COUNT = Signature(
     "quad_swarm_count",
     "E n m",
@@ -182,6 +200,7 @@ TABLE: dict[str, Signature] = {
     "resample": _RESAMPLE,
     "keep_right": _KEEP_RIGHT,
     "neighbours": _NEIGHBOURS,
+    "anticipate": _ANTICIPATE,
     "measure": _measure("E n m"),
     "measure_all": _measure("n m E"),  # without `others`
     "count": _COUNT,

@@ -16,6 +16,7 @@ from quad_swarm.errors import shown
 from quad_swarm.native.pairs import advance
 from quad_swarm.planner import Plans, base
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
+from quad_swarm.world.anticipation import Scene
 from quad_swarm.world.beliefs import Beliefs, resampled
 from quad_swarm.world.commitment import Commitment
 from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
@@ -104,7 +105,7 @@ class Robot:
         self.commitment = Commitment.of(config.planner, 1, 1)
         self.disturbance = DisturbanceEstimate.of(self.planner, 1, 1)
         self.period = round(1e6 * config.planner.dt)
-        self.beliefs: Beliefs = make_beliefs(config, 1, 1)
+        self.beliefs: Beliefs = make_beliefs(config, 1, 1, self.others[None])
         # What the others presumably believe about this robot, from what it sent
         self.presumed: Beliefs = make_beliefs(config, 1, 1)
         self.reset(np.zeros(3), np.zeros(3))
@@ -223,7 +224,15 @@ class Robot:
         :param stages: indices among the next N periods, counting from 0
         """
         predicted = self.presumed.predict(*self._own_motion())
-        return SeenByOthers(predicted.believed(stages), predicted.remembers, predicted.age, predicted.error)
+        believed = predicted.believed(stages)
+        outlook = self.beliefs.predict(self._pos, self._vel, self._scene()).outlook
+        if outlook is not None:
+            expected = outlook.own[:, :, None, np.array(stages) + 1]
+            believed = np.where(predicted.remembers[..., None, None], believed, expected)
+        return SeenByOthers(believed, predicted.remembers, predicted.age, predicted.error)
+
+    def _scene(self) -> Scene:
+        return Scene(self._estimate, self.obstacles)
 
     @property
     def plans(self) -> Plans:
@@ -330,7 +339,8 @@ class Robot:
                 *_, plans, ages = self._message(self._sent, *self._own_motion())
                 newest = ages.argmin()
                 self.commitment.sent(np.ones((1, 1), bool), plans[None, None, newest], ages[newest])
-        believed, self.source = self.beliefs.update(*self._message(self._inbox, self._pos, self._vel))
+        arrived = self._message(self._inbox, self._pos, self._vel)
+        believed, self.source = self.beliefs.update(*arrived, scene=self._scene())
         late = np.full((1, 1), self.late) if self.late else None
         goal_velocity = None
         if self._route is not None and self.hold is None:
@@ -353,7 +363,7 @@ class Robot:
         """Let a period pass in which nothing was computed."""
         self.now += self.period
         self.presumed.receive(*self._message({}, *self._own_motion()))
-        self.beliefs.receive(*self._message({}, self._pos, self._vel))
+        self.beliefs.receive(*self._message({}, self._pos, self._vel), scene=self._scene())
         if self.commitment is not None:
             self.commitment.advance()
         if self.disturbance is not None:
@@ -380,7 +390,9 @@ class Robot:
         own, shape = self._estimate[..., None, :], self._pos.shape
         return np.broadcast_to(own[..., POSITION], shape), np.broadcast_to(own[..., VELOCITY], shape)
 
-    def _message(self, plans: Mapping[int, Plan], pos: np.ndarray, vel: np.ndarray) -> tuple[Any, ...]:
+    def _message(
+        self, plans: Mapping[int, Plan], pos: np.ndarray, vel: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the arguments of `Beliefs.receive` for plans by places."""
         arriving = np.zeros((1, 1, len(self.others)), dtype=bool)
         arriving[0, 0, list(plans)] = True

@@ -15,6 +15,7 @@ import numpy as np
 from quad_swarm.geometry import closest_approach, flattened, length
 from quad_swarm.native.pairs import advance, nearest_obstacle
 from quad_swarm.quadrotor import POSITION, VELOCITY
+from quad_swarm.world.anticipation import Scene
 from quad_swarm.world.beliefs import PlanApproach, Prediction, of_others
 from quad_swarm.world.knowledge import Knowledge, SeenByOthers
 
@@ -112,7 +113,7 @@ class View:
     @cached_property
     def prediction(self) -> Prediction:
         """Predictions of the others without requests, in the world frame."""
-        return self._knowledge.beliefs.predict(*self._observed)
+        return self._knowledge.beliefs.predict(*self._observed, Scene(self._estimate, self._knowledge.obstacles))
 
     def expected(self, stages: Sequence[int] | None = None) -> np.ndarray:
         """Return the predicted relative positions of the others without requests, (E, n, n - 1, stages, 3) (m).

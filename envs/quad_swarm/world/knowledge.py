@@ -15,6 +15,7 @@ from quad_swarm.geometry import dot, length
 from quad_swarm.native.pairs import resample
 from quad_swarm.planner import Problems
 from quad_swarm.quadrotor import POSITION, VELOCITY, VehicleModel
+from quad_swarm.world.anticipation import Anticipation, load_predictor
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
 from quad_swarm.world.commitment import Commitment
 from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
@@ -32,7 +33,7 @@ class SeenByOthers(NamedTuple):
     """How each of the others predicts a robot, as far as that robot knows.
 
     :param believed: predicted positions at the given stages, (E, n, n - 1, stages, 3), world frame (m)
-    :param remembers: whether the prediction is a plan, otherwise a constant velocity, (E, n, n - 1) bool
+    :param remembers: whether the prediction is a plan, (E, n, n - 1) bool
     :param age: steps since that plan was made, (E, n, n - 1)
     :param error: current error of that plan, (E, n, n - 1) (m)
     """
@@ -109,15 +110,20 @@ class Knowledge(Protocol):
         """
 
 
-def make_beliefs(config: SwarmConfig, n_swarms: int, n_robots: int) -> Beliefs:
+def make_beliefs(config: SwarmConfig, n_swarms: int, n_robots: int, order: np.ndarray | None = None) -> Beliefs:
     """Create the beliefs that robots begin with: they have received no plan.
 
     :param config: the world
     :param n_swarms: number of swarms E
     :param n_robots: number of robots whose beliefs these are
+    :param order: where the others are among the robots that each sees, (n, n - 1), see `Anticipation`; None for beliefs
+        that are about plans only, and predict a constant velocity without one
     """
     horizon, dt, misfit = config.planner.horizon, config.planner.dt, _MISFIT * config.least_separation
-    return Beliefs(n_swarms, n_robots, horizon, dt, config.memory, config.n_others, misfit)
+    anticipation = None
+    if config.predictor is not None and order is not None:
+        anticipation = Anticipation(load_predictor(config.predictor), horizon, n_swarms, order)
+    return Beliefs(n_swarms, n_robots, horizon, dt, config.memory, config.n_others, misfit, anticipation)
 
 
 def make_problems(

@@ -23,6 +23,7 @@ from quad_swarm.plants.base import MODEL, Plant, make_plant, parse_plant
 from quad_swarm.quadrotor import VELOCITY, MixedModel, QuadrotorParams, VehicleModel
 from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, angles, checked, points, replaced, vectors
 from quad_swarm.vehicles import DOWNWASH, load_vehicle
+from quad_swarm.world.anticipation import load_predictor
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
 from quad_swarm.world.doubts import (
     doubts,
@@ -85,6 +86,8 @@ class SwarmConfig:
         state at that time
     :param vehicles: what is different about the robots, at most one entry for each: robot i is the i-th, and where
         there are fewer entries than robots, they repeat. By default, all robots are alike
+    :param predictor: network that predicts others whose plan is not known, a name of
+        `quad_swarm.world.anticipation.PREDICTORS` or the path of a file (.npz); None for constant velocities
     :raises ValueError: if a value is out of range, the planner's separation or the spacing of starts and goals is less
         than 2r, the tolerance hides every collision, a step is too long for the vehicle's dynamics, or robots could
         tilt or turn too far; with ``vehicles``, if this holds for a team of one of them, the message names which, there
@@ -111,6 +114,7 @@ class SwarmConfig:
     mismatch: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     clock_skew: Annotated[float, Field(ge=0, lt=1)] = 0.0
     vehicles: tuple[VehicleConfig, ...] = ()
+    predictor: str | None = None
 
     def __post_init__(self) -> None:
         if self.planner.separation < 2 * self.radius:
@@ -118,6 +122,7 @@ class SwarmConfig:
                 f"planner.separation={self.planner.separation}: it must be at least 2 * radius = {2 * self.radius}, "
                 "or left out to follow the radius"
             )
+        self._check_predictor()
         if self.vehicles:
             self._check_vehicles()
             return
@@ -125,6 +130,17 @@ class SwarmConfig:
         self._check_vehicle()
         for sentence in doubts(self):
             warn(sentence)
+
+    def _check_predictor(self) -> None:
+        if self.predictor is None:
+            return
+        found, planner = load_predictor(self.predictor), self.planner
+        if found.dt != planner.dt or found.horizon < planner.horizon:
+            raise ValueError(
+                f"predictor={self.predictor!r} predicts {found.horizon} steps of {found.dt:g} s, but "
+                f"planner.horizon={planner.horizon}, planner.dt={planner.dt:g}: train one for this world "
+                "(`python -m studies.swarm.anticipation`), or set predictor to None for constant velocities"
+            )
 
     def _check_vehicles(self) -> None:
         """Check that robots of each kind could fly as a team of their own, and warn of what is doubtful about it."""
@@ -639,6 +655,12 @@ _FLIGHT = SwarmConfig(
     clock_skew=0.8,
 )
 
+_FLIGHT_V2 = replace(
+    _FLIGHT,
+    planner=replace(_FLIGHT.planner, disturbance_time=1.0, commitment=1.0, obstacle_penalty=30.0, braking_reserve=0.15),
+    radio=Radio(loss=0.1, round_trip=0, jitter=1),
+)
+
 PRESETS: dict[str, SwarmConfig] = {
     # The paper's four robots. The planner's separation is exactly 2r, which makes communication matter.
     "paper": SwarmConfig(),
@@ -652,13 +674,9 @@ PRESETS: dict[str, SwarmConfig] = {
     # Version 2 of `flight`: answers count when they come, and robots hold against wind and payloads, keep to the plans
     # that they sent, give way to obstacles before others, and slow down before obstacles. See docs/flight.md for what
     # each of these is worth.
-    "flight-v2": replace(
-        _FLIGHT,
-        planner=replace(
-            _FLIGHT.planner, disturbance_time=1.0, commitment=1.0, obstacle_penalty=30.0, braking_reserve=0.15
-        ),
-        radio=Radio(loss=0.1, round_trip=0, jitter=1),
-    ),
+    "flight-v2": _FLIGHT_V2,
+    # Version 3: robots also predict others whose plan they do not know by a network that learned how such robots move.
+    "flight-v3": replace(_FLIGHT_V2, predictor="flight"),
     # The same team without motion capture and in more wind: errors two to four times as large, interrupted links, and
     # robots that stop answering.
     "flight-hard": replace(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import operator
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from quad_swarm.planner import MixedPlanner, Planner, Plans, Problems
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.validation import points
+from quad_swarm.world.anticipation import Scene
 from quad_swarm.world.beliefs import Beliefs, of_others, other_indices, resampled
 from quad_swarm.world.commitment import Commitment
 from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
@@ -141,7 +143,7 @@ class Swarm(SwarmState):
             _u=np.zeros((n_swarms, n, 4)),
             _plans=plans,
             _radio=make_channel(config.radio, plans_of_robots[..., POSITION], config.n_others),
-            beliefs=make_beliefs(config, n_swarms, n),
+            beliefs=make_beliefs(config, n_swarms, n, self._order()),
             _other_beliefs=make_beliefs(config, n_swarms, n) if differ else None,
             disturbances=Realisation(config, n_swarms),
             neighbours=Neighbours(n_swarms, n, config.neighbourhood),
@@ -157,6 +159,16 @@ class Swarm(SwarmState):
             number[self._pairs] = np.arange(len(self._pairs[0]))
             # Index of the pair of each robot and each of its others
             self._pair_of = np.take_along_axis(number + number.T, other_indices(n), axis=1)
+
+    def _order(self) -> np.ndarray:
+        """Return where the others are among the robots that each perceives, (n, n - 1): all in ascending order, or
+        itself last."""
+        n, m = self.config.n_robots, self.config.n_others
+        return other_indices(n) if m == n - 1 else np.broadcast_to(np.arange(m), (n, m))
+
+    def scene(self) -> Scene:
+        """Return what robots see beside the others."""
+        return Scene(self._estimate(), self.obstacles)
 
     @property
     def beliefs_seen_by_others(self) -> Beliefs:
@@ -218,14 +230,22 @@ class Swarm(SwarmState):
 
         :param stages: indices among the next N steps, counting from 0
         """
-        predictions, estimate = self.beliefs_seen_by_others.predict(*self._seen_by_all()), self._estimate()
+        estimate = self._estimate()
+        predictions = self.beliefs_seen_by_others.predict(*self._seen_by_all(), self.scene())
         # Others that do not perceive this robot have no plan of it: they predict a constant velocity
         times = self.config.planner.dt * (np.array(stages) + 1)
         steady = estimate[..., None, POSITION] + times[:, None] * estimate[..., None, VELOCITY]
-        theirs = self.neighbours.of_the_other
+        theirs, remembers = self.neighbours.of_the_other, predictions.remembers
+        outlook = self.beliefs.predict(*self.observe(), self.scene()).outlook
+        if outlook is not None:
+            steady = outlook.own[:, :, np.array(stages) + 1]
+            predictions = replace(predictions, outlook=None)
+        believed = theirs(predictions.believed(stages), steady[:, :, None])
+        if outlook is not None:
+            believed = np.where(theirs(remembers)[..., None, None], believed, steady[:, :, None])
         return SeenByOthers(
-            theirs(predictions.believed(stages), steady[:, :, None]),
-            theirs(predictions.remembers),
+            believed,
+            theirs(remembers),
             theirs(predictions.age, self.config.planner.horizon),
             theirs(predictions.error),
         )
@@ -493,7 +513,7 @@ class Swarm(SwarmState):
             self._other_beliefs.receive(sent, *self._seen_by_all(), *self._radio.answers(sent, others))
         answered, lateness = self.disturbances.arrivals(carried, others)
         arriving, received, age = self._radio.deliver(answered, others, lateness)
-        return self.beliefs.update(arriving, *self.observe(), received, age)
+        return self.beliefs.update(arriving, *self.observe(), received, age, self.scene())
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
         """Return the robots' planning problems, which start when their inputs take effect."""

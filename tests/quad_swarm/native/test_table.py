@@ -13,7 +13,12 @@ from quad_swarm.planner.rti import solver
 NATIVE = Path(table.__file__).parent
 SOURCES = {NATIVE / table.SOURCE: list(table.TABLE.values()), Path(solver.__file__).with_name("kernel.cpp"): None}
 SHORT = {"std::int64_t": "Integer", "std::uint8_t": "Flag"}
-IN_C = {np.dtype(np.float64): "double", np.dtype(np.int64): "Integer", np.dtype(np.bool_): "Flag"}
+IN_C = {
+    np.dtype(np.float64): "double",
+    np.dtype(np.float32): "float",
+    np.dtype(np.int64): "Integer",
+    np.dtype(np.bool_): "Flag",
+}
 IN_C[table.STATISTICS] = "Statistics"
 
 

@@ -84,6 +84,8 @@ def differences(config, policies, rule, scenario, model=None, steps=60, episode=
         ("flight", 3, "crossing_traffic"),
         ("flight-v2", 3, "symmetric_swap"),
         ("flight-v2", 3, "forest"),
+        ("flight-v3", 3, "symmetric_swap"),
+        ("flight-v3", 4, "crossing_traffic"),
         ("flight-hard", 4, "tour"),
         ("flight", 3, "moving_goals"),
     ],
@@ -164,7 +166,7 @@ def test_robots_that_start_in_flight_and_turn_fly_as_the_swarm(world):
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 @pytest.mark.parametrize("n", [2, 4, 8])
-@pytest.mark.parametrize("preset", ["paper", "flight", "flight-v2", "flight-hard"])
+@pytest.mark.parametrize("preset", ["paper", "flight", "flight-v2", "flight-v3", "flight-hard"])
 def test_robots_with_rules_fly_as_the_swarm_anywhere(preset, n, scenario):
     config = make_config(preset, n_robots=n)
     for rule in RULES:
@@ -205,12 +207,12 @@ def test_robots_fly_as_the_swarm_in_changed_worlds(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["paper", "flight", "flight-v2", "flight-hard"])
+@pytest.mark.parametrize("preset", ["paper", "flight", "flight-v2", "flight-v3", "flight-hard"])
 @pytest.mark.parametrize("n", [2, 4, 8])
 def test_robots_with_a_learned_policy_fly_as_the_swarm(preset, n, tmp_path):
     pytest.importorskip("onnxruntime")
     config = make_config(preset, n_robots=n)
-    path = AMONG_OBSTACLES if preset == "flight-v2" else MODEL
+    path = AMONG_OBSTACLES if preset in ("flight-v2", "flight-v3") else MODEL
     written, model = export(path, config, tmp_path), load_model(path, "sb3_maddpg:MADDPG")
     edges = []
 
