@@ -1,4 +1,4 @@
-"""Fly the sealed tests of `flight-v2`: full communication, none, rules, models, and rivals.
+"""Fly the sealed tests of `flight-v2` and `flight-v3`: full communication, none, rules, models, and rivals.
 
 ``python -m studies.swarm.version2 [--part full ...] [--episodes ...] [--jobs 2] [--json F]`` flies sets on which
 nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios with eight robots), ``sixteen``,
@@ -53,7 +53,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING = 713, 715, 716, 717, 718, 719
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD = 713, 715, 716, 717, 718, 719, 720
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -70,6 +70,13 @@ OWN_MODEL = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.4"
 MASK_ONLY = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.001"
 BOLDER = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.5"
 CHEAP_RULES = ("plan:1.0s&stale:4", "stage:0.7:0.3", "stage:0.8:0.3", "cpa:1.0s:3&stale:8")
+# What flies in version 3, of which the threshold and the rule were chosen on sets 66, 70 and 71
+THIRD_POLICIES = {
+    "model": f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.6",
+    "none": "none",
+    "full": "full",
+    "rule": "stage:1.0:0.5",
+}
 # Of those who do not tell
 ORCA = "orca"
 OTHER_SEEDS = tuple(f"studies/swarm/data/flight_v2_seed{seed}.zip@0.4" for seed in (1, 2, 3, 4))
@@ -101,6 +108,7 @@ class Part(NamedTuple):
     :param plant: what flies
     :param vehicle: whose model the planner has, None for the preset's
     :param changes: further fields of the world
+    :param preset: the preset
     """
 
     policies: tuple[str, ...]
@@ -111,6 +119,7 @@ class Part(NamedTuple):
     plant: str = MODEL
     vehicle: str | None = None
     changes: Mapping[str, Any] = {}
+    preset: str = "flight-v2"
 
 
 PARTS = {
@@ -184,6 +193,12 @@ PARTS = {
     "hard": Part(("full", OWN_MODEL), SWAPS, (8,), 1000, STRANGE, changes=HARD),
     "many": Part(("full", OWN_MODEL), ("random_swap",), (24, 32), 300, STRANGE),
 }
+SIZES = {"four": 4, "eight": 8, "twelve": 12, "sixteen": 16}
+PARTS |= {
+    f"third_{what}_{size}": Part((policy,), EVERYWHERE, (n,), 2000, THIRD, preset="flight-v3")
+    for what, policy in THIRD_POLICIES.items()
+    for size, n in SIZES.items()
+}
 
 
 def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, Any]]:
@@ -193,7 +208,7 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
     """
     count = episodes or part.episodes
     for n in part.n_robots:
-        config = make_config(world("flight-v2", n), part.changes, plant=part.plant, quadrotor=part.vehicle)
+        config = make_config(world(part.preset, n), part.changes, plant=part.plant, quadrotor=part.vehicle)
         if part.set < AMONG:
             config = make_config(config, ALIKE)
         if part.set < BRAKING:
@@ -220,7 +235,7 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
                 keys = {"policy": named(policy), "scenario": scenario, "n_robots": n, "plant": part.plant}
                 yield (
                     keys
-                    | {"vehicle": part.vehicle, "set": part.set, "hard": part.changes is HARD}
+                    | {"vehicle": part.vehicle, "set": part.set, "hard": part.changes is HARD, "preset": part.preset}
                     | summarise(rows, config)
                 )
 

@@ -7,14 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch as th
 
 from quad_swarm.evaluation.rows import read_rows, write_rows
 from quad_swarm.geometry import length
+from quad_swarm.native import anticipation
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.task.rules import parse_rule
+from quad_swarm.world.anticipation import load_predictor
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.swarm import Swarm
 from studies import wind
+from studies.swarm import anticipation as learned_anticipation
 from studies.swarm import commitment, delay_check, fly, half_spaces, report, tune_flight, version2
 from studies.swarm.experiment import Experiment
 from studies.swarm.protocol import EARLIER, EARLIER_TEAMS, FLIGHT_TESTS, NAMES, TEST, VALIDATION, WORLDS
@@ -46,8 +51,9 @@ def test_sets_of_episodes_are_apart():
         version2.STRANGE,
         version2.BOLD,
         version2.LACKING,
+        version2.THIRD,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 24
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 25
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
@@ -473,3 +479,34 @@ def test_orca_flies_the_sealed_test_as_a_planner_of_its_own():
 def test_wind_moves_robots_beside_their_goals_unless_they_estimate_it():
     assert wind.distance("paper", 4.0, None) > 0.3
     assert wind.distance("paper", 4.0, 1.0) < 0.01
+
+
+def test_robots_learn_what_others_plan(tmp_path, capsys):
+    """With three robots in one scenario, in seconds, in a world of one's own that limits whom robots perceive."""
+    world = make_config("flight-v2", {"neighbourhood": {"max_others": 1}}, n_robots=3)
+    with ThreadPoolExecutor(1) as pool:
+        learned_anticipation.train([world], ["random_swap"], 2, 6, pool, tmp_path / "mine.npz")
+    number, rows, _, _, learned, *steady, _ = capsys.readouterr().out.strip().splitlines()[-1].split()
+    assert number == "2"
+    assert int(rows) > 1000
+    assert float(learned) < 0.8 * float(steady[-1])  # root mean square errors after a second
+    mine = load_predictor(str(tmp_path / "mine.npz"))
+    assert '"n_robots": [3]' in mine.about
+    assert Swarm(make_config(world, predictor=str(tmp_path / "mine.npz"))).beliefs.horizon == mine.horizon
+
+
+def test_what_is_trained_is_what_flies():
+    network = learned_anticipation.Network(20)
+    config = make_config("flight-v3", n_robots=4)
+    swarm = Swarm(config)
+    starts = np.array([[3.0, 0, 1.2], [0, 3, 1.2], [-3, 0, 1.2], [0, -3, 1.2]])
+    swarm.reset(0, starts, -starts * [1, 1, -1])
+    for _ in range(10):
+        swarm.step(np.zeros((1, 4, 3), bool))
+    seen = swarm.beliefs.predict(*swarm.observe(), swarm.scene()).outlook.of_others
+    own, bodies, near = (th.from_numpy(array.reshape(-1, *array.shape[3:])) for array in anticipation.features(seen))
+    change = network(own, bodies, near).detach().numpy().reshape(1, 4, 3, 20, 3)
+    weights = network.weights(), learned_anticipation.HIDDEN, learned_anticipation.WIDTH
+    expected = anticipation.anticipate(seen, *weights, 20, 0.05)
+    assert np.allclose(anticipation.outputs(seen, expected[..., 1:, :], 0.05), change, atol=1e-4)
+    assert np.abs(change).max() > 0.01

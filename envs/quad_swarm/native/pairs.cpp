@@ -70,10 +70,11 @@ inline void steady(const double* pos, const double* vel, const std::vector<doubl
 
 // A layer of a network: its biases, then a row of weights for each input. Returns where the next layer's weights are.
 const float* layer(const float* weights, const float* in, Integer n_in, Integer n_out, bool rectified, float* out) {
-  constexpr Integer block = 16;  // fits into registers
-  for (Integer first = 0; first < n_out; first += block) {
-    const Integer count = std::min(block, n_out - first);
-    float sums[block] = {};
+  constexpr Integer block = 32;  // fits into registers, and hides the latency of additions
+  for (Integer from = 0; from < n_out; from += block) {
+    // The last block overlaps the one before
+    const Integer first = n_out < block ? 0 : std::min(from, n_out - block), count = std::min(block, n_out);
+    float sums[block];
     if (count == block) {
       for (Integer k = 0; k < block; k++) sums[k] = weights[first + k];
       for (Integer i = 0; i < n_in; i++) {
@@ -81,9 +82,9 @@ const float* layer(const float* weights, const float* in, Integer n_in, Integer 
         for (Integer k = 0; k < block; k++) sums[k] += in[i] * row[k];
       }
     } else {
-      for (Integer k = 0; k < count; k++) sums[k] = weights[first + k];
+      for (Integer k = 0; k < count; k++) sums[k] = weights[k];
       for (Integer i = 0; i < n_in; i++)
-        for (Integer k = 0; k < count; k++) sums[k] += in[i] * weights[(i + 1) * n_out + first + k];
+        for (Integer k = 0; k < count; k++) sums[k] += in[i] * weights[(i + 1) * n_out + k];
     }
     for (Integer k = 0; k < count; k++) out[first + k] = rectified ? std::max(sums[k], 0.0f) : sums[k];
   }
