@@ -32,6 +32,7 @@ from quad_swarm.native import anticipation
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.anticipation import Predictor
 from quad_swarm.world.beliefs import of_others
+from quad_swarm.world.doubts import moving_alike
 from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from quad_swarm.world.swarm import StepReport, Swarm
@@ -204,7 +205,9 @@ def train(
     :param out: file to write
     """
     horizon, dt = configs[0].planner.horizon, configs[0].planner.dt
-    about = json.dumps({"n_robots": [one.n_robots for one in configs], "scenarios": list(scenarios)})
+    about = json.dumps(
+        {"n_robots": [one.n_robots for one in configs], "scenarios": list(scenarios), "world": common(configs)}
+    )
     weights = np.zeros(anticipation.count_weights(HIDDEN, WIDTH, horizon), np.float32)  # constant velocities
     learned: list[Seen] = []
     table = [["round", "rows", *(f"{time:g} s" for time in _SHOWN), "at constant velocity", "minutes"]]
@@ -236,6 +239,12 @@ def train(
             minutes = (time.monotonic() - started) / 60
             table.append([str(number + 1), str(rows), *texts[0].split(" / "), texts[1], f"{minutes:.1f}"])
             print(aligned(table, 0), flush=True)
+
+
+def common(configs: Sequence[SwarmConfig]) -> dict[str, Any]:
+    """Return the fields on which it depends how robots move, and that worlds have in common."""
+    first, *rest = map(moving_alike, configs)
+    return {name: value for name, value in first.items() if all(one[name] == value for one in rest)}
 
 
 def _split(seeds: range) -> tuple[range, range]:

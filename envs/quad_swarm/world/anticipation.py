@@ -37,7 +37,7 @@ class Predictor(NamedTuple):
     :param width: width of the layers after them
     :param horizon: number of stages N that it predicts
     :param dt: length of a stage (s)
-    :param about: what it was trained in, JSON
+    :param about: what it was trained in, JSON: the worlds' common fields under "world"
     """
 
     weights: np.ndarray
@@ -46,6 +46,12 @@ class Predictor(NamedTuple):
     horizon: int
     dt: float
     about: str = "{}"
+
+    @property
+    def trained_in(self) -> dict[str, Any]:
+        """The fields of the world that it was trained in, as far as they are known, by the names that ``--world``
+        has."""
+        return dict(json.loads(self.about).get("world", {}))
 
     def save(self, path: Path) -> None:
         """Write the network to a file, which `load_predictor` reads."""
@@ -97,7 +103,8 @@ def _load(name: str, changed: int) -> Predictor:
             raise ValueError("its weights do not fit its sizes")
         if not np.isfinite(predictor.weights).all():
             raise ValueError("a weight is not finite")
-        if not isinstance(json.loads(predictor.about), dict):
+        about = json.loads(predictor.about)
+        if not isinstance(about, dict) or not isinstance(about.get("world", {}), dict):
             raise ValueError("it does not say what it is")
     except (OSError, ValueError, KeyError, TypeError, OverflowError, zipfile.BadZipFile) as error:
         raise ValueError(

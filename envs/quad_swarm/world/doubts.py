@@ -9,17 +9,21 @@ which a robot stands in a steady wind that the planner does not know.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import json
 import math
 import warnings
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from quad_swarm.errors import shown
 from quad_swarm.geometry import length
 from quad_swarm.planner import PlannerConfig
 from quad_swarm.quadrotor import QuadrotorParams
+from quad_swarm.world.anticipation import load_predictor
 
 if TYPE_CHECKING:
     from quad_swarm.world.presets import SwarmConfig
@@ -227,6 +231,7 @@ def doubts(config: SwarmConfig) -> Iterator[str]:
     """Yield a sentence about everything that is doubtful about a world, with a field and what to do. How vehicles with
     dynamics from outside move is not known here."""
     yield from _doubts_about_obstacles(config)
+    yield from _doubts_about_predictions(config)
     if not config.flies_quadrotors:
         yield from _doubts_about_the_others(config)
         return
@@ -414,6 +419,31 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
         yield (
             f"memory={config.memory:g}: plans count as right that are off by more than the distance at which robots "
             f"touch, {2 * config.radius:g} m; use a few centimetres, as in the presets"
+        )
+
+
+def moving_alike(config: SwarmConfig) -> dict[str, Any]:
+    """Return the fields of a world on which it depends how its robots move, by the names that ``--world`` has, as
+    JSON has them. They hardly fly along the walls of the workspace."""
+    nested = {name: dataclasses.asdict(getattr(config, name)) for name in ("planner", "quadrotor")}
+    named = {f"{name}.{field}": value for name, fields in nested.items() for field, value in fields.items()}
+    walls = {"planner.workspace_low", "planner.workspace_high"}
+    known = {name: value for name, value in named.items() if name not in walls}
+    return json.loads(json.dumps({"radius": config.radius, **known}))
+
+
+def _doubts_about_predictions(config: SwarmConfig) -> Iterator[str]:
+    if config.predictor is None:
+        return
+    trained, here = load_predictor(config.predictor).trained_in, moving_alike(config)
+    others = [name for name, value in here.items() if trained.get(name, value) != value]
+    if others:
+        name = others[0]
+        yield (
+            f"predictor={config.predictor!r} learned how robots move with {name}={shown(trained[name])} instead of "
+            f"{shown(here[name])}{f' and {len(others) - 1} other fields' if len(others) > 1 else ''}: here, its "
+            "predictions may be wrong; train one for this world (`python -m studies.swarm.anticipation`), or use "
+            "predictor=null"
         )
 
 

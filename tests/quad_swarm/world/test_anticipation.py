@@ -8,6 +8,7 @@ import pytest
 from quad_swarm.native import anticipation
 from quad_swarm.world.anticipation import PREDICTORS, Anticipation, Predictor, Scene, load_predictor
 from quad_swarm.world.beliefs import Beliefs, BeliefSource, other_indices
+from quad_swarm.world.doubts import DoubtfulWorld
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.swarm import Swarm
 
@@ -192,9 +193,12 @@ def test_what_others_expect_of_a_robot_is_what_it_expects_of_itself(foreign):
     theirs = swarm.neighbours.of_the_other(believed(swarm, [0, 7, 19]))
     assert np.allclose(mine, theirs)
     # and without the network it is a constant velocity
-    plain = Swarm(make_config(swarm.config, predictor=None))
-    place(plain)
+    plain = Swarm(make_config(swarm.config, {"predictor": None}))
+    assert plain.config.predictor is None
+    plain.load_state_dict(swarm.state_dict())
     assert not np.allclose(plain.seen_by_others([19]).believed, mine[..., 2:, :])
+    steady = swarm.pos + 20 * DT * swarm.vel
+    assert np.allclose(plain.seen_by_others([19]).believed, steady[:, :, None, None])
 
 
 @pytest.mark.parametrize("neighbourhood", [{}, {"max_others": 2}])
@@ -239,6 +243,18 @@ def test_the_network_that_ships_avoids_most_collisions_of_robots_that_do_not_tal
     assert collided["flight"] <= 1
 
 
-def test_what_a_network_was_trained_in_is_said():
+def test_what_a_network_was_trained_in_is_said_and_other_worlds_are_doubtful(tmp_path, recwarn):
     about = json.loads(load_predictor("flight").about)
-    assert set(about) >= {"n_robots", "scenarios"}
+    assert about["n_robots"] == [4, 8, 12, 16]
+    make_config("flight-v3")
+    make_config("flight-v3", n_robots=16, space={"circle_radius": [3.5, 4.0]})
+    assert not recwarn.list
+    with pytest.warns(DoubtfulWorld, match=r"'flight' learned.*planner.max_speed=4.0 instead of 3.0: .*predictor=null"):
+        make_config("flight-v3", planner={"max_speed": 3.0})
+    with pytest.warns(DoubtfulWorld, match=r"quadrotor.drag_x=0.25 instead of 0.0142 and 7 other fields"):
+        make_config("flight-v3", quadrotor="x500")
+    # Of a network that does not say it, nothing is known
+    network().save(tmp_path / "mine.npz")
+    recwarn.clear()
+    make_config("flight-v2", predictor=str(tmp_path / "mine.npz"), planner={"max_speed": 3.0})
+    assert not recwarn.list
