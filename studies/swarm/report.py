@@ -43,11 +43,22 @@ from studies.swarm.figures import (
 from studies.swarm.fly import PAPERS
 from studies.swarm.protocol import DATA, OF_TEAM, ROOT, best_rules, models
 from studies.swarm.tune_flight import FULL, SWAPS, best_rule
-from studies.swarm.version2 import BOLDER, BRAKING, CHEAP_RULES, MASK_ONLY, ORCA, OWN_MODEL, STRANGE, named
+from studies.swarm.version2 import (
+    BOLDER,
+    BRAKING,
+    CHEAP_RULES,
+    MASK_ONLY,
+    ORCA,
+    OWN_MODEL,
+    STRANGE,
+    THIRD,
+    THIRD_POLICIES,
+    named,
+)
 
 APPENDICES = ("paper_worlds", "swarm_tables", "flight_tables", "teams", "robustness", "asking")
 RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
-FLIGHT = ("flight", "flight_policies", "flight_experiments")
+FLIGHT = ("flight", "flight_policies", "flight_experiments", "anticipation")
 PAGES = (
     ROOT / "README.md",
     *(ROOT / "docs" / f"{page}.md" for page in (*RESULTS, "swarm_learning", *FLIGHT, "obstacles", "simulators")),
@@ -613,6 +624,35 @@ def cells_table(rows: Rows) -> str:
     return table(["scenario", *(f"{n} robots" for n in sizes), "full, all sizes"], lines)
 
 
+def anticipation_table(rows: Rows) -> str:
+    """Format the flights in `flight-v3` by scenario and number of robots: who of those that send nothing, of a rule
+    and of the packaged model of version 2 collide.
+
+    :param rows: rows of `studies.swarm.version2` in that preset
+    """
+    cells = {(row["scenario"], row["n_robots"], row["policy"]): row for row in rows if row["plant"] == MODEL}
+    sizes = sorted({row["n_robots"] for row in rows})
+    model, rule = (named(THIRD_POLICIES[what]) for what in ("model", "rule"))
+    lines = []
+    for name in (*NAMES, *MOST_OBSTACLES):
+        line = [name.replace("_", " ")]
+        for n in sizes:
+            full, texts = cells.get((name, n, FULL)), []
+            for policy in ("none", rule, model):
+                one = cells.get((name, n, policy))
+                if one is None or full is None:
+                    texts.append("-")
+                    continue
+                text = judged(one, full)
+                if policy != "none":
+                    text += f"; {one['request_share']:.2%}"
+                later = one["steps_to_arrival"] / full["steps_to_arrival"] - 1
+                texts.append(f"{text}; {later:+.0%}".replace("-0%", "+0%").replace(" ", "&nbsp;"))
+            line.append("<br>".join(texts))
+        lines.append(line)
+    return table(["scenario", *(f"{n} robots" for n in sizes)], lines)
+
+
 def judged(own: dict[str, Any], full: dict[str, Any]) -> str:
     """Format collisions, with a mark unless they are within the margin of full communication."""
     counts = [one[key] for one in (own, full) for key in ("collisions", "episodes")]
@@ -751,6 +791,7 @@ def main() -> None:
     rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))
     # Those in other disturbances, or with more robots, are no part of the tables
     sealed_2 = [row for row in read_rows(VERSION_2 / "version2.json") if row["set"] != STRANGE]
+    sealed_3 = [row for row in read_rows(VERSION_2 / "version3.json") if row["set"] == THIRD]
     tried_2 = read_rows(VERSION_2 / "front.json")
     blocks = {
         "targets": targets(test),
@@ -781,6 +822,7 @@ def main() -> None:
         "version 2": version_2_table(sealed_2),
         "cells": cells_table(sealed_2),
         "obstacles": obstacles_table(sealed_2),
+        "anticipation": anticipation_table(sealed_3),
         "flight": flight_table(rows["flight"]),
         "flight tuning": tuned_table(rows["flight_tuning"]),
         "flight targets": flight_targets(rows["flight"]),

@@ -25,9 +25,13 @@ collide in 200 symmetric swaps of eight robots in ``studies/data/front.json``, t
 0.5, ``cheap_eight`` and ``cheap_sixteen``; set 717 ``hard``, the packaged model in the disturbances of `flight-hard`,
 and ``many``, with 24 and 32 robots; set 718 ``bold_four``, ``bold_eight``, ``bold_twelve`` and ``bold_sixteen``, the
 packaged model at 0.5 everywhere, after set 716 had shown that cheap rules are not safe with sixteen robots where this
-threshold is; set 719 ``lacking_eight``, what full communication of eight lacks of 12,000. All parts before set 706 fly
-with equal penalties, those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and
-number of robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
+threshold is; set 719 ``lacking_eight``, what full communication of eight lacks of 12,000; set 720 ``third_model_SIZE``,
+``third_none_SIZE``, ``third_full_SIZE`` and ``third_rule_SIZE``, all scenarios in `flight-v3` with four to sixteen
+robots: the packaged model of version 2, nobody, everybody, and a rule that tells; set 721 ``third_hard``,
+``third_hummingbird``, ``third_crazyflie`` and ``third_many``, these in the disturbances of `flight-hard`, in the
+foreign simulators, and with 24 and 32 robots. All parts before set 706 fly with equal penalties, those before set 709
+without the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`;
+written after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -53,7 +57,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD = 713, 715, 716, 717, 718, 719, 720
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE = 713, 715, 716, 717, 718, 719, 720, 721
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -198,6 +202,15 @@ PARTS |= {
     f"third_{what}_{size}": Part((policy,), EVERYWHERE, (n,), 2000, THIRD, preset="flight-v3")
     for what, policy in THIRD_POLICIES.items()
     for size, n in SIZES.items()
+}
+_THREE = tuple(THIRD_POLICIES[what] for what in ("full", "none", "model"))
+PARTS |= {
+    "third_hard": Part(_THREE, SWAPS, (8,), 1000, ELSEWHERE, changes=HARD, preset="flight-v3"),
+    "third_hummingbird": Part(
+        _THREE, SWAPS, (8,), 1000, ELSEWHERE, "rotorpy:hummingbird", "hummingbird", preset="flight-v3"
+    ),
+    "third_crazyflie": Part(_THREE, SWAPS, (8,), 1000, ELSEWHERE, "crazyflow:cf21B_500", preset="flight-v3"),
+    "third_many": Part(_THREE, ("random_swap",), (24, 32), 300, ELSEWHERE, preset="flight-v3"),
 }
 
 

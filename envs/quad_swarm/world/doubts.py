@@ -441,9 +441,9 @@ def _doubts_about_predictions(config: SwarmConfig) -> Iterator[str]:
         name = others[0]
         yield (
             f"predictor={config.predictor!r} learned how robots move with {name}={shown(trained[name])} instead of "
-            f"{shown(here[name])}{f' and {len(others) - 1} other fields' if len(others) > 1 else ''}: here, its "
-            "predictions may be wrong; train one for this world (`python -m studies.swarm.anticipation`), or use "
-            "predictor=null"
+            f"{shown(here[name])}{f' and {len(others) - 1} other fields' if len(others) > 1 else ''}: whether "
+            "it helps here is to be seen; fly with and without (predictor=null), or train one for this world "
+            "(`python -m studies.swarm.anticipation`)"
         )
 
 
