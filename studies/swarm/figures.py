@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, PercentFormatter
 
-from quad_swarm.evaluation.flight import Flight, fly
+from quad_swarm.evaluation.flight import Flight, begin, first_episode, fly
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.figures.colours import COLOURS, INK, LEARNED, RULES, STYLE
@@ -293,6 +295,41 @@ def draw_trajectories(flown: dict[str, dict[str, Flight]], path: Path) -> None:
             draw_flight(axes, flight)
             axes.set_title(f"{WORLDS.get(preset, preset)}: {name.replace('_', ' ')}")
     explain_flights(figure, panels[0][0])
+    figure.savefig(path)
+
+
+@rc_context(STYLE)
+def draw_expectations(path: Path) -> None:
+    """Draw what a robot that is told nothing expects of the others in a symmetric swap of eight, by a network and at
+    constant velocities, beside what they then do."""
+    config = make_config("flight-v3", n_robots=8)
+    shown, horizon = (18, 30), config.planner.horizon
+    policy, task, rngs = begin(condition("none", "symmetric_swap", config), [first_episode(EARLIER)])
+    flown, expected = [task.swarm.pos[0].copy()], {}
+    for step in range(max(shown) + horizon):
+        if step in shown:
+            swarm = task.swarm
+            prediction = swarm.beliefs.predict(*swarm.observe(), swarm.scene())
+            expected[step] = [
+                one.believed()[0, 0] for one in (prediction, replace(prediction, outlook=None))
+            ]  # of the first robot
+        task.act(policy(task, rngs))
+        flown.append(task.swarm.pos[0].copy())
+    paths = np.array(flown)
+    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    for axes, step in zip(figure.subplots(1, 2, sharey=True), shown, strict=True):
+        now, later = paths[step], paths[step : step + horizon + 1]
+        for other in range(1, 8):
+            axes.plot(*later[:, other, :2].T, color=INK, linewidth=4, alpha=0.25, label="what they do")
+            network, steady = (one[other - 1] for one in expected[step])
+            axes.plot(*network[:, :2].T, color=LEARNED, label="expected by the network")
+            axes.plot(*steady[:, :2].T, "--", color=RULES, label="at constant velocity")
+        axes.plot(*now[1:, :2].T, "o", color=INK, label="the others")
+        axes.plot(*now[0, :2], "o", color=LEARNED, markersize=9, label="the robot that expects")
+        axes.set(aspect="equal", xlabel="x (m)", title=f"after {step * config.planner.dt:.1f} s, the next second")
+    handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    figure.axes[0].set_ylabel("y (m)")
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3)
     figure.savefig(path)
 
 

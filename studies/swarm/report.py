@@ -31,6 +31,7 @@ from studies.swarm.figures import (
     as_shipped,
     by_policy,
     draw_asking,
+    draw_expectations,
     draw_flight_fronts,
     draw_fronts,
     draw_trajectories,
@@ -855,6 +856,7 @@ def main() -> None:
         sealed = rows["flight"], rows["flight_sixteen_sealed"]
         draw_flight_fronts(tried, *sealed, args.images / "front_flight.png")
     draw_version_2(sealed_2, tried_2, args.images / "front_version_2.png")
+    draw_expectations(args.images / "expectations.png")
     if flown:
         draw_trajectories(flown, args.images / "flights.png")
     if asking:

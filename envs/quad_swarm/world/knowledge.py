@@ -172,7 +172,9 @@ def make_problems(
         resample(believed, late)
     announced, penalty = None, None
     if config.planner.right_of_way:
-        announced = (source != int(BeliefSource.CONSTANT_VELOCITY)).reshape(-1, source.shape[2])
+        # Of those whose motion is known: a network expects them to keep to the convention
+        known = (source != int(BeliefSource.CONSTANT_VELOCITY)) | (config.predictor is not None)
+        announced = known.reshape(-1, source.shape[2])
     if (of_predicted := config.planner.prediction_penalty) != 1:
         known = source != int(BeliefSource.CONSTANT_VELOCITY)
         penalty = np.where(known, 1.0, of_predicted).reshape(-1, source.shape[2])

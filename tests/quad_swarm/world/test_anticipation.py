@@ -102,6 +102,15 @@ def test_a_world_with_other_steps_is_refused(foreign, planner):
         make_config("flight-v2", planner=planner, predictor=foreign)
 
 
+def test_robots_keep_right_of_all_whom_a_network_predicts(foreign):
+    nobody = np.zeros((1, 3, 2), bool)
+    for predictor, known in ((None, False), (foreign, True)):
+        swarm = Swarm(make_config("flight-v2", {"predictor": predictor}, n_robots=3))
+        place(swarm)
+        problems = swarm._problems(*swarm._believe(nobody))
+        assert (problems.announced == known).all()
+
+
 def test_a_shorter_horizon_takes_the_first_steps(foreign):
     long, short = (
         Swarm(make_config("flight-v2", n_robots=3, predictor=foreign, planner={"horizon": horizon}))
