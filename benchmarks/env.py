@@ -48,6 +48,7 @@ WORLDS: dict[str, dict[str, Any]] = {
     "flight, no disturbances": {"preset": "flight", "world": EXACT},
     "flight, no right of way": {"preset": "flight", "planner": {"right_of_way": 0.0}},
     "flight-v2": {"preset": "flight-v2"},
+    "flight-v3": {"preset": "flight-v3"},
 }
 CELLS = [
     *((face, world, 1) for face in ("gym", "render") for world in ("paper", "dense")),

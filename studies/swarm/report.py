@@ -48,6 +48,7 @@ from studies.swarm.version2 import (
     BOLDER,
     BRAKING,
     CHEAP_RULES,
+    ELSEWHERE,
     MASK_ONLY,
     ORCA,
     OWN_MODEL,
@@ -625,30 +626,61 @@ def cells_table(rows: Rows) -> str:
     return table(["scenario", *(f"{n} robots" for n in sizes), "full, all sizes"], lines)
 
 
+def front_table(second: Rows, third: Rows, page: str) -> str:
+    """Format the symmetric swap of eight robots at a glance: how others are predicted, who sends, what it costs.
+
+    :param second: rows of `studies.swarm.version2` in `flight-v2`
+    :param third: those in `flight-v3`
+    :param page: address of the planner's page
+    """
+
+    def flown(rows: Rows, policy: str) -> dict[str, Any]:
+        here = [row for row in rows if hardest(row, 8) and row["plant"] == MODEL and row["set"] != ELSEWHERE]
+        return merged([row for row in here if row["policy"] == named(policy)])
+
+    full, steady = flown(third, FULL), flown(second, "none")
+    lines = []
+    for predicted, who, row in (
+        ("constant velocity", "nobody", steady),
+        (f"[ORCA]({page}#without-messages-orca-and-voronoi-cells)", "nobody", flown(second, ORCA)),
+        ("network", "nobody", flown(third, "none")),
+        ("network", f"rule `{THIRD_POLICIES['rule']}`", flown(third, THIRD_POLICIES["rule"])),
+        ("network", "**learned**", flown(third, THIRD_POLICIES["model"])),
+        ("network", "everybody", full),
+    ):
+        later = f"{row['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%")
+        if row is steady:  # only those arrive that met nobody
+            later = "-"
+        elif row is full:
+            later = f"{full['steps_to_arrival'] * PRESETS['flight-v3'].planner.dt:.1f} s"
+        lines.append([predicted, who, seeds_rate([row]), f"{row['request_share']:.2%}", later])
+    return table(["others are predicted by", "who sends", "flights with a collision", "plans sent", "arrival"], lines)
+
+
 def anticipation_table(rows: Rows) -> str:
-    """Format the flights in `flight-v3` by scenario and number of robots: who of those that send nothing, of a rule
-    and of the packaged model of version 2 collide.
+    """Format the flights in `flight-v3` by scenario and number of robots: who collides if nobody sends anything, by a
+    rule, and with the packaged model of version 2. Without flights of full communication, they are not compared.
 
     :param rows: rows of `studies.swarm.version2` in that preset
     """
-    cells = {(row["scenario"], row["n_robots"], row["policy"]): row for row in rows if row["plant"] == MODEL}
+    cells = {(row["scenario"], row["n_robots"], row["policy"]): row for row in rows}
     sizes = sorted({row["n_robots"] for row in rows})
-    model, rule = (named(THIRD_POLICIES[what]) for what in ("model", "rule"))
+    policies = {"nobody": "none", "rule": THIRD_POLICIES["rule"], "model": named(THIRD_POLICIES["model"])}
     lines = []
     for name in (*NAMES, *MOST_OBSTACLES):
         line = [name.replace("_", " ")]
         for n in sizes:
             full, texts = cells.get((name, n, FULL)), []
-            for policy in ("none", rule, model):
-                one = cells.get((name, n, policy))
-                if one is None or full is None:
-                    texts.append("-")
+            for who, policy in policies.items():
+                if (one := cells.get((name, n, policy))) is None:
                     continue
-                text = judged(one, full)
+                parts = [str(one["collisions"]) if full is None else judged(one, full)]
                 if policy != "none":
-                    text += f"; {one['request_share']:.2%}"
-                later = one["steps_to_arrival"] / full["steps_to_arrival"] - 1
-                texts.append(f"{text}; {later:+.0%}".replace("-0%", "+0%").replace(" ", "&nbsp;"))
+                    parts.append(f"{one['request_share']:.2%}")
+                if full is not None:
+                    later = one["steps_to_arrival"] / full["steps_to_arrival"] - 1
+                    parts.append(f"{later:+.0%}".replace("-0%", "+0%"))
+                texts.append(f"*{who}:*&nbsp;" + "; ".join(parts).replace(" ", "&nbsp;"))
             line.append("<br>".join(texts))
         lines.append(line)
     return table(["scenario", *(f"{n} robots" for n in sizes)], lines)
@@ -824,6 +856,8 @@ def main() -> None:
         "cells": cells_table(sealed_2),
         "obstacles": obstacles_table(sealed_2),
         "anticipation": anticipation_table(sealed_3),
+        "front": front_table(sealed_2, sealed_3, "docs/planner.md"),
+        "front results": front_table(sealed_2, sealed_3, "planner.md"),
         "flight": flight_table(rows["flight"]),
         "flight tuning": tuned_table(rows["flight_tuning"]),
         "flight targets": flight_targets(rows["flight"]),

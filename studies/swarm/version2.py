@@ -229,9 +229,10 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
             config = make_config(config, UNRESERVED)
         for scenario in part.scenarios:
             flown: dict[str, Rows] = {}
-            orca = make_config(config, {"planner": {"problem": "orca"}})
             conditions = {
-                policy: replace(condition("none", scenario, orca), solver=ORCA)
+                policy: replace(
+                    condition("none", scenario, make_config(config, {"planner": {"problem": "orca"}})), solver=ORCA
+                )
                 if policy == ORCA
                 else condition(policy, scenario, config)
                 for policy in part.policies

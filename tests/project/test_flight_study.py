@@ -306,6 +306,38 @@ def test_plans_that_passed_the_delay_check_never_come_near_each_other(delay):
     assert length(swarm.pos - swarm.goal).max() < 1.0
 
 
+def test_tables_of_version_3_say_who_sends_and_what_it_costs():
+    def row(policy: str, collisions: int, share: float, steps: float, **changed) -> dict:
+        figures = {"n_robots": 8, "scenario": "symmetric_swap", "policy": policy, "plant": "model", "episodes": 2000}
+        figures |= {"collisions": collisions, "request_share": share, "steps_to_arrival": steps, "arrived": 1000}
+        low, high = 0.0, 0.01
+        return figures | {"set": version2.THIRD, "collision_low": low, "collision_high": high} | changed
+
+    rule, model = (version2.named(version2.THIRD_POLICIES[what]) for what in ("rule", "model"))
+    third = [row("none", 2, 0.0, 68.6), row(rule, 1, 0.0025, 70.0), row(model, 0, 0.0003, 71.4), row("full", 0, 1, 70)]
+    third += [row("none", 5, 0.0, 90.0, n_robots=16), row("full", 9, 1.0, 99.0, set=version2.ELSEWHERE)]
+    second = [
+        row("none", 1800, 0.0, 90.0, set=710),
+        row("orca", 4, 0.0, 77.0, set=716),
+        row("full", 7, 1.0, 1.0, set=703),
+    ]
+    text = report.front_table(second, third, "planner.md").replace("&nbsp;", " ").replace("<br>", " ")
+    cells = [line.strip("| ").split(" | ")[1:] for line in text.splitlines()[2:]]
+    assert cells == [
+        ["nobody", "1,800 of 2,000 [88.61, 91.24] %", "0.00%", "-"],
+        ["nobody", "4 of 2,000 [0.08, 0.51] %", "0.00%", "+10%"],
+        ["nobody", "2 of 2,000 [0.03, 0.36] %", "0.00%", "-2%"],
+        [f"rule `{rule}`", "1 of 2,000 [0.01, 0.28] %", "0.25%", "+0%"],
+        ["**learned**", "0 of 2,000 [0.00, 0.19] %", "0.03%", "+2%"],
+        ["everybody", "0 of 2,000 [0.00, 0.19] %", "100.00%", "3.5 s"],
+    ]
+    text = report.anticipation_table([row for row in third if row["set"] == version2.THIRD]).replace("&nbsp;", " ")
+    head, _, first, *_ = text.splitlines()
+    assert head == "| scenario | 8 robots | 16 robots |"
+    assert first.split(" | ")[1] == "*nobody:* 2†; -2%<br>*rule:* 1; 0.25%; +0%<br>*model:* 0; 0.03%; +2%"
+    assert first.strip("| ").split(" | ")[2] == "*nobody:* 5"
+
+
 def test_a_delay_check_needs_a_longest_delay():
     with pytest.raises(ValueError, match=r"radio\.jitter=1"):
         delay_check.DelayCheckedSwarm(make_config("flight"), 1, clearance=0.62)
