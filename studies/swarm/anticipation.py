@@ -30,7 +30,7 @@ from quad_swarm.evaluation.evaluation import make_pool
 from quad_swarm.evaluation.rows import aligned
 from quad_swarm.native import anticipation
 from quad_swarm.validation import read_assignments
-from quad_swarm.world.anticipation import Predictor
+from quad_swarm.world.anticipation import SUFFIX, Predictor
 from quad_swarm.world.beliefs import of_others
 from quad_swarm.world.doubts import moving_alike
 from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_config
@@ -259,11 +259,15 @@ def main() -> None:
     parser.add_argument("--preset", default="flight-v2", choices=list(PRESETS))
     parser.add_argument("--world", nargs="+", action="extend", default=[], metavar="NAME=VALUE")
     parser.add_argument("--n-robots", nargs="+", type=int, default=[4, 8, 12, 16])
-    parser.add_argument("--scenarios", nargs="+", default=[one for one in SCENARIOS if one != "mixed"])
+    parser.add_argument("--scenarios", nargs="+", default=list(SCENARIOS), choices=list(SCENARIOS))
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--episodes", type=int, default=64)
     parser.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args()
+    if args.out.suffix != SUFFIX or not args.out.absolute().parent.is_dir():
+        parser.error(f"--out {args.out}: name a file that ends with {SUFFIX}, in a folder that exists")
+    if min(args.rounds, args.episodes, args.jobs) < 1:
+        parser.error("--rounds, --episodes and --jobs must be at least 1")
     changes: dict[str, Any] = read_assignments("--world", args.world)
     configs = [make_config(world(args.preset, n), changes) for n in args.n_robots]
     with make_pool(args.jobs) as pool:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from quad_swarm.evaluation.command import preset_of, run
+from quad_swarm.evaluation.command import add_limits_argument, check_limits, preset_of, run
 from quad_swarm.evaluation.evaluation import user_modules
 from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import first_episode
@@ -261,6 +261,7 @@ def make_parser() -> Parser:
     parser.add_argument(
         "--world", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="fields of the preset"
     )
+    add_limits_argument(parser)
     parser.add_argument("--plant", help="simulated vehicle, such as crazyflow:cf21B_500 (default: the preset's)")
     names = [name for name in SCENARIOS if name not in CHANGING_GOALS]
     parser.add_argument("--scenario", choices=names, default="symmetric_swap", help="(default %(default)s)")
@@ -305,6 +306,7 @@ def _main(args: argparse.Namespace) -> None:
     worlds = {one: files.load(one).config for one in sorted(exported)}
     preset, base = _base(args.preset, models, worlds)
     config = make_config(base, read_assignments("--world", args.world), n_robots=args.n_robots, plant=args.plant)
+    check_limits(args.limits, config)
     _check_radio(config, make_config(base))
     config = for_scenario(config, args.scenario)
     if not 0 <= args.priority <= 99:

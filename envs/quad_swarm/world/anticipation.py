@@ -26,7 +26,8 @@ from quad_swarm.world.obstacles import Obstacles
 _PACKAGED = Path(__file__).with_name("predictors")
 # Name -> file
 PREDICTORS = {path.stem: path for path in sorted(_PACKAGED.glob("*.npz"))}
-_SUFFIX, _LARGEST_FILE, _WIDEST = ".npz", 10_000_000, 1024
+SUFFIX = ".npz"
+_LARGEST_FILE, _WIDEST = 10_000_000, 1024
 
 
 class Predictor(NamedTuple):
@@ -66,7 +67,7 @@ def load_predictor(name: str) -> Predictor:
     :param name: a name of `PREDICTORS`, or the path of a file, which ends with .npz
     :raises ValueError: if the name is unknown, or the file is missing, or holds no network; the message names it
     """
-    if not name.endswith(_SUFFIX):
+    if not name.endswith(SUFFIX):
         if name not in PREDICTORS:
             raise unknown_name("predictor", name, [*PREDICTORS, "FILE.npz"])
         return _load(str(PREDICTORS[name]), 0)

@@ -141,6 +141,8 @@ def test_a_rule_from_the_current_folder_flies_in_the_robots_processes(tmp_path, 
         (["--policy", "none", "--priority", "100"], "--priority 100"),
         (["--policy", "none", "--plant", "gazebo"], "gazebo"),
         (["--policy", "none", "--world", "substeps=7"], "whole microseconds"),
+        (["--policy", "none", "--limits", "fence=0.3"], "give room=[[xlow"),
+        (["--policy", "none", "--limits", "room=[[-5,-5,0],[5,5,3]]"], "limits.room: "),
     ],
 )
 def test_wrong_words_are_one_line(words, told, capsys):
