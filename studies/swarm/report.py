@@ -634,11 +634,13 @@ def front_table(second: Rows, third: Rows, page: str) -> str:
     :param page: address of the planner's page
     """
 
-    def flown(rows: Rows, policy: str) -> dict[str, Any]:
+    def flown(rows: Rows, policy: str) -> dict[str, Any] | None:
         here = [row for row in rows if hardest(row, 8) and row["plant"] == MODEL and row["set"] != ELSEWHERE]
-        return merged([row for row in here if row["policy"] == named(policy)])
+        chosen = [row for row in here if row["policy"] == named(policy)]
+        return merged(chosen) if chosen else None
 
     full, steady = flown(third, FULL), flown(second, "none")
+    assert full is not None
     lines = []
     for predicted, who, row in (
         ("constant velocity", "nobody", steady),
@@ -648,6 +650,8 @@ def front_table(second: Rows, third: Rows, page: str) -> str:
         ("network", "**learned**", flown(third, THIRD_POLICIES["model"])),
         ("network", "everybody", full),
     ):
+        if row is None:
+            continue
         later = f"{row['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%")
         if row is steady:  # only those arrive that met nobody
             later = "-"
