@@ -643,12 +643,12 @@ def front_table(second: Rows, third: Rows, page: str) -> str:
     assert full is not None
     lines = []
     for predicted, who, row in (
-        ("constant velocity", "nobody", steady),
-        (f"[ORCA]({page}#without-messages-orca-and-voronoi-cells)", "nobody", flown(second, ORCA)),
-        ("network", "nobody", flown(third, "none")),
-        ("network", f"rule `{THIRD_POLICIES['rule']}`", flown(third, THIRD_POLICIES["rule"])),
-        ("network", "**learned**", flown(third, THIRD_POLICIES["model"])),
-        ("network", "everybody", full),
+        ("constant velocity (`flight-v2`)", "nobody", steady),
+        (f"[ORCA]({page}#without-messages-orca-and-voronoi-cells) (`flight-v2`)", "nobody", flown(second, ORCA)),
+        ("network (`flight-v3`)", "nobody", flown(third, "none")),
+        ("network (`flight-v3`)", f"rule `{THIRD_POLICIES['rule']}`", flown(third, THIRD_POLICIES["rule"])),
+        ("network (`flight-v3`)", "**learned**", flown(third, THIRD_POLICIES["model"])),
+        ("network (`flight-v3`)", "everybody", full),
     ):
         if row is None:
             continue
