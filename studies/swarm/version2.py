@@ -29,10 +29,11 @@ threshold is; set 719 ``lacking_eight``, what full communication of eight lacks 
 ``third_none_SIZE``, ``third_full_SIZE`` and ``third_rule_SIZE``, all scenarios in `flight-v3` with four to sixteen
 robots: the packaged model of version 2, nobody, everybody, and a rule that tells; set 723 ``third_hard``,
 ``third_hummingbird``, ``third_crazyflie`` and ``third_many``, these in the disturbances of `flight-hard`, in the
-foreign simulators, and with 24 and 32 robots. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813,
-before robots of version 3 kept right of predicted others; set 721 never flew. All parts before set 706 fly with equal
-penalties, those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and number of
-robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
+foreign simulators, and with 24 and 32 robots; set 724 ``third_seeds_SIZE``, all scenarios in `flight-v3` with the
+recipe's other training seeds. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before robots
+of version 3 kept right of predicted others; set 721 never flew. All parts before set 706 fly with equal penalties,
+those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and number of robots with the
+keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE = 713, 715, 716, 717, 718, 719, 722, 723
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS = 713, *range(715, 720), 722, 723, 724
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -85,6 +86,7 @@ THIRD_POLICIES = {
 # Of those who do not tell
 ORCA = "orca"
 OTHER_SEEDS = tuple(f"studies/swarm/data/flight_v2_seed{seed}.zip@0.4" for seed in (1, 2, 3, 4))
+BOLDER_SEEDS = tuple(f"studies/swarm/data/flight_v2_seed{seed}.zip@0.6" for seed in (1, 2, 3, 4))
 # The disturbances of `flight-hard`, which is a world of version 1
 HARD: dict[str, Any] = {
     name: getattr(PRESETS["flight-hard"], name) for name in ("noise", "sensing", "mismatch", "max_steps")
@@ -202,6 +204,10 @@ SIZES = {"four": 4, "eight": 8, "twelve": 12, "sixteen": 16}
 PARTS |= {
     f"third_{what}_{size}": Part((policy,), EVERYWHERE, (n,), 2000, THIRD, preset="flight-v3")
     for what, policy in THIRD_POLICIES.items()
+    for size, n in SIZES.items()
+}
+PARTS |= {
+    f"third_seeds_{size}": Part(BOLDER_SEEDS, EVERYWHERE, (n,), 500, OTHERS, preset="flight-v3")
     for size, n in SIZES.items()
 }
 _THREE = tuple(THIRD_POLICIES[what] for what in ("full", "none", "model"))

@@ -52,9 +52,10 @@ def test_sets_of_episodes_are_apart():
         version2.BOLD,
         version2.LACKING,
         version2.THIRD,
+        version2.OTHERS,
         version2.ELSEWHERE,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 26
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 27
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
