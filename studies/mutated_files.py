@@ -40,6 +40,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tqdm import tqdm
 
 from quad_swarm.evaluation.rows import write_rows
+from quad_swarm.world.anticipation import PREDICTORS, load_predictor
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.swarm import Swarm
 from sb3_maddpg import MADDPG, MATD3, PrioritizedTeamReplayBuffer, SafeVecNormalize, checkpoints
 from sb3_maddpg.checkpoints.commit import sha256
 from sb3_maddpg.cli.safety import RunLoader
@@ -240,6 +243,7 @@ def files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
     recipe = {"policy": "MlpPolicy", "n_timesteps": 5, "env_kwargs": {"a": [1, 2]}}
     again = {f"{key}_{k}": value for k in range(2) for key, value in recipe.items()}
     (folder / "config.yml").write_text(yaml.dump(recipe | again))
+    shutil.copy(PREDICTORS["flight"], folder / "predictor.npz")
     found = checkpoints.newest(folder / "run")
     assert found is not None
 
@@ -265,10 +269,21 @@ def files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
         "buffer.pkl": buffer,
         "stats.pkl": lambda path: SafeVecNormalize.load(str(path), DummyVecEnv([OwnBit])),
         "config.yml": lambda path: yaml.load(path.read_bytes(), RunLoader),
+        "predictor.npz": lambda path: load_predictor(str(path.rename(path.with_suffix(".npz")))),
     }
     loaded = {name: ((folder / name).read_bytes(), load) for name, load in kinds.items()}
     names = ("manifest.json", "state.json", "arrays.npz")
     return loaded | {f"checkpoint {name}": ((found / name).read_bytes(), checkpoint(name)) for name in names}
+
+
+def _fly_with(path: Path) -> None:
+    """Fly with the predictor of a file."""
+    predictor = str(path.rename(path.with_suffix(".npz")))
+    swarm = Swarm(make_config("flight-v3", predictor=predictor, n_robots=3))
+    swarm.reset(0, np.array([[0.0, 0, 1], [2, 0, 1], [0, 2, 1]]), np.array([[2.0, 0, 1], [0, 2, 1], [0, 0, 1]]))
+    for _ in range(3):
+        swarm.step(np.zeros((1, 3, 2), bool))
+    assert np.isfinite(swarm.state).all()
 
 
 def used_files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
@@ -323,6 +338,8 @@ def used_files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
         found.save(str(folder / "again.pkl"))
 
     made["used statistics"] = ((folder / "statistics.pkl").read_bytes(), load_statistics)
+
+    made["used predictor"] = PREDICTORS["flight"].read_bytes(), _fly_with
 
     def callbacks() -> list[BaseCallback]:
         return [StopTrainingOnMaxEpisodes(10**6), EvalCallback(env(), eval_freq=50, n_eval_episodes=1, verbose=0)]

@@ -65,7 +65,7 @@ def test_damaged_files_are_refused_or_harmless(tmp_path, seed):
     rows = read_rows(tmp_path / "files.json")
     assert sum(row["count"] for row in rows) == 370
     assert {row["outcome"] for row in rows} == {"refused", "loaded"}
-    assert len({row["file"] for row in rows}) == 17
+    assert len({row["file"] for row in rows}) == 19
 
 
 @pytest.mark.slow

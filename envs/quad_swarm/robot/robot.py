@@ -225,7 +225,9 @@ class Robot:
         """
         predicted = self.presumed.predict(*self._own_motion())
         believed = predicted.believed(stages)
-        outlook = self.beliefs.predict(self._pos, self._vel, self._scene()).outlook
+        outlook = None
+        if self.config.predictor is not None:
+            outlook = self.beliefs.predict(self._pos, self._vel, self._scene()).outlook
         if outlook is not None:
             expected = outlook.own[:, :, None, np.array(stages) + 1]
             believed = np.where(predicted.remembers[..., None, None], believed, expected)

@@ -21,16 +21,18 @@ _OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 Take = Callable[[Any, Any], None]
 
 
-def quality(depth: int, lasting: bool = False) -> Any:
+def quality(depth: int, reliable: bool = False, lasting: bool = False) -> Any:
     """Return the quality of service of a topic: best effort, since what is lost is out of date when it is sent again.
 
     :param depth: messages that wait for their receiver; one of plans would lose answers that arrive together
-    :param lasting: reliable instead, also for those who come later
+    :param reliable: reliable instead: publishers for foreign subscribers, which may require it, and with some
+        middlewares do so by default; such a publisher also reaches those who do not
+    :param lasting: reliable, and also for those who come later
     """
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
     return QoSProfile(
-        reliability=ReliabilityPolicy.RELIABLE if lasting else ReliabilityPolicy.BEST_EFFORT,
+        reliability=ReliabilityPolicy.RELIABLE if reliable or lasting else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if lasting else DurabilityPolicy.VOLATILE,
         history=HistoryPolicy.KEEP_LAST,
         depth=depth,

@@ -94,7 +94,7 @@ class PlantNode:
         self.vehicles, self._node = Vehicles(config), node
         self.vehicles.warm_up()
         self._topics = VehicleTopics(node, self._mailbox, self.names, self.vehicles.command)
-        self._status = node.create_publisher(msgs().DiagnosticArray, "/world/status", quality(5))
+        self._status = node.create_publisher(msgs().DiagnosticArray, "/world/status", quality(5, reliable=True))
         node.create_service(Trigger, "/world/reset", self._reset)
         self._ends: int | None = None
         self.reset()

@@ -315,7 +315,7 @@ class RobotNode:
         link = RosLink(self.node, self._mailbox, index, names)
         period = round(config.planner.dt * 1e6)
         vehicle = make_vehicle((self.node, self._mailbox, link, names), values, period)
-        self._status = self.node.create_publisher(msgs().DiagnosticArray, f"/{name}/status", quality(5))
+        self._status = self.node.create_publisher(msgs().DiagnosticArray, f"/{name}/status", quality(5, reliable=True))
         # Goals must arrive; whoever sends one to a robot that does not fly yet is told so by the log
         self._mailbox.subscribe(msgs().PoseStamped, f"/{name}/goal_pose", 10, self._take_goal)
         self.node.create_service(Trigger, "~/land", self._take_wish)

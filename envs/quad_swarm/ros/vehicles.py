@@ -128,7 +128,7 @@ class TeamVehicle:
         return self._link.shared(self._link.now())
 
     def _publisher(self, kind: type, topic: str) -> Any:
-        return self._node.create_publisher(kind, f"/{self._name}/{topic}", quality(1))
+        return self._node.create_publisher(kind, f"/{self._name}/{topic}", quality(1, reliable=True))
 
 
 class OdometryVehicle(TeamVehicle):

@@ -84,7 +84,9 @@ class VehicleTopics:
     def __init__(self, node: Any, mailbox: Mailbox, names: Sequence[str], command: Callable[[int, np.ndarray], None]):
         self._states = [SerialisedOdometry(f"{one}/base_link") for one in names]
         self._told = [0] * len(names)
-        self._odometry = [node.create_publisher(msgs().Odometry, f"/{one}/odom", quality(1)) for one in names]
+        self._odometry = [
+            node.create_publisher(msgs().Odometry, f"/{one}/odom", quality(1, reliable=True)) for one in names
+        ]
         for number, name in enumerate(names):
 
             def take(message: Any, handler: Handler, number: int = number) -> None:

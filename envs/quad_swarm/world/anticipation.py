@@ -28,6 +28,7 @@ _PACKAGED = Path(__file__).with_name("predictors")
 PREDICTORS = {path.stem: path for path in sorted(_PACKAGED.glob("*.npz"))}
 SUFFIX = ".npz"
 _LARGEST_FILE, _WIDEST = 10_000_000, 1024
+_LARGEST_WEIGHT = 1e3  # five layers of the widest stay below the largest float32
 
 
 class Predictor(NamedTuple):
@@ -70,19 +71,19 @@ def load_predictor(name: str) -> Predictor:
     if not name.endswith(SUFFIX):
         if name not in PREDICTORS:
             raise unknown_name("predictor", name, [*PREDICTORS, "FILE.npz"])
-        return _load(str(PREDICTORS[name]), 0)
+        return _load(str(PREDICTORS[name]), ())
     try:
-        changed = os.stat(name).st_mtime_ns
+        found = os.stat(name)
     except OSError:
         raise ValueError(
             f"predictor={shown(name)}: there is no such file; use one of {', '.join(PREDICTORS)}, or a file that "
             "`python -m studies.swarm.anticipation --out` wrote."
         ) from None
-    return _load(name, changed)
+    return _load(name, (found.st_mtime_ns, found.st_size, found.st_ino))
 
 
 @functools.lru_cache(maxsize=16)
-def _load(name: str, changed: int) -> Predictor:
+def _load(name: str, version: tuple[int, ...]) -> Predictor:
     path = Path(name)
     try:
         if not path.is_file():
@@ -96,18 +97,20 @@ def _load(name: str, changed: int) -> Predictor:
         predictor = Predictor(
             np.ascontiguousarray(found["weights"]), hidden, width, horizon, float(found["dt"]), str(found["about"])
         )
-        if not (0 < hidden <= _WIDEST and 0 < width <= _WIDEST and 0 < horizon <= _WIDEST and predictor.dt > 0):
+        if not (
+            0 < hidden <= _WIDEST and 0 < width <= _WIDEST and 0 < horizon <= _WIDEST and 0 < predictor.dt < np.inf
+        ):
             raise ValueError("its sizes are out of range")
         if predictor.weights.dtype != np.float32 or predictor.weights.shape != (
             anticipation.count_weights(hidden, width, horizon),
         ):
             raise ValueError("its weights do not fit its sizes")
-        if not np.isfinite(predictor.weights).all():
-            raise ValueError("a weight is not finite")
+        if not (np.abs(predictor.weights) <= _LARGEST_WEIGHT).all():
+            raise ValueError(f"a weight is not finite, or larger than {_LARGEST_WEIGHT:g}")
         about = json.loads(predictor.about)
         if not isinstance(about, dict) or not isinstance(about.get("world", {}), dict):
             raise ValueError("it does not say what it is")
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, zipfile.BadZipFile) as error:
+    except Exception as error:  # readers of damaged archives and arrays raise what they like
         raise ValueError(
             f"predictor={shown(name)}: this is no file of `python -m studies.swarm.anticipation --out` "
             f"({shown(str(error))}). Write it anew."

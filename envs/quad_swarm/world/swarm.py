@@ -236,7 +236,7 @@ class Swarm(SwarmState):
         times = self.config.planner.dt * (np.array(stages) + 1)
         steady = estimate[..., None, POSITION] + times[:, None] * estimate[..., None, VELOCITY]
         theirs, remembers = self.neighbours.of_the_other, predictions.remembers
-        outlook = self.beliefs.predict(*self.observe(), self.scene()).outlook
+        outlook = None if self.config.predictor is None else self.beliefs.predict(*self.observe(), self.scene()).outlook
         if outlook is not None:
             steady = outlook.own[:, :, np.array(stages) + 1]
             predictions = replace(predictions, outlook=None)

@@ -38,7 +38,7 @@ def test_messages_are_handed_over_while_somebody_waits(monkeypatch):
     mailbox, got = nodes.Mailbox(node), []
     try:
         for lasting in (False, True):
-            profile = nodes.quality(5, lasting)
+            profile = nodes.quality(5, lasting=lasting)
             publisher = node.create_publisher(msgs().String, f"/test_{lasting}", profile)
             mailbox.subscribe(
                 msgs().String, f"/test_{lasting}", profile, lambda m, handler: got.append((m.data, handler))

@@ -13,7 +13,7 @@ import pytest
 
 from quad_swarm.geometry import from_quaternion, to_frd, to_ned, to_quaternion
 from quad_swarm.realtime.attitude import GRAVITY, AttitudeController, AttitudeGains
-from quad_swarm.realtime.link import Traffic
+from quad_swarm.realtime.link import Traffic, monotonic
 from quad_swarm.robot import Plan
 
 pytest.importorskip("rclpy")
@@ -22,6 +22,7 @@ from geometry_msgs.msg import Pose, Twist, Vector3
 from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 
+from quad_swarm.ros import node as nodes
 from quad_swarm.ros import vehicles
 from quad_swarm.ros.messages import msgs, rotation, to_odometry
 from quad_swarm.ros.world import names_of
@@ -357,3 +358,28 @@ def test_missing_messages_are_named(kind, package, options, monkeypatch):
     monkeypatch.setitem(sys.modules, f"{package}.msg", None)
     with pytest.raises(ImportError, match=rf"{package} is not there: build it"):
         make(kind, **options)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "topic", "message"),
+    [(vehicles.OdometryVehicle, "cmd", "TwistStamped"), (vehicles.LegacyCrazyswarmVehicle, "cmd_vel_legacy", "Twist")],
+)
+def test_commands_reach_subscribers_that_require_reliability(monkeypatch, vehicle, topic, message):
+    """As Crazyswarm2's server does under Cyclone DDS, where the system's default is reliable."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")  # a node finds itself
+    node = nodes.make_node("alone")
+    mailbox, got = nodes.Mailbox(node), []
+    try:
+        link = Link()
+        robot = vehicle(node, mailbox, link, NAMES)
+        reliable_by_default = 10
+        mailbox.subscribe(
+            getattr(msgs(), message), f"/{NAMES[0]}/{topic}", reliable_by_default, lambda m, handler: got.append(m)
+        )
+        ends = monotonic() + 20_000_000
+        while not got and monotonic() < ends:
+            robot.command(np.array([0.1, 0.0, 0.2, 0.0]), None)
+            mailbox.wait(monotonic() + 50_000, None, lambda: bool(got))
+        assert got
+    finally:
+        mailbox.close()

@@ -1,6 +1,8 @@
 """Robots that predict others by a network: files, memory of velocities, and what follows from the predictions."""
 
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,6 +60,9 @@ def test_packaged_networks_are_whole():
         ({"hidden": 10**6}, "out of range"),
         ({"dt": 0.0}, "out of range"),
         ({"dt": np.nan}, "out of range"),
+        ({"dt": np.inf}, "out of range"),
+        ({"weights": np.full_like(network().weights, 3e38)}, "not finite, or larger than 1000"),
+        ({"about": "[" * 100_000}, ""),
         ({"about": "[]"}, "does not say"),
         ({"about": "{"}, ""),
         ({"horizon": "many"}, ""),
@@ -78,6 +83,36 @@ def test_other_files_are_refused(tmp_path, content):
     path.mkdir() if content is None else path.write_bytes(content)
     with pytest.raises(ValueError, match=r"(?s)bad.npz.*Write it anew"):
         load_predictor(str(path))
+
+
+def test_damaged_files_are_refused_or_hold_a_network(foreign):
+    """Bits flip, ends are missing: some readers of archives and arrays have errors of their own."""
+    whole, rng, refused = Path(foreign).read_bytes(), np.random.default_rng(0), []
+    for number in range(400):
+        content = bytearray(whole)
+        for place in rng.integers(len(whole), size=rng.integers(1, 4)):
+            content[place] ^= 1 << rng.integers(8)
+        Path(foreign).write_bytes(content[: rng.integers(len(whole)) if rng.random() < 0.2 else None])
+        os.utime(foreign, ns=(number, int(rng.integers(2**40))))  # another file
+        try:
+            assert np.isfinite(load_predictor(foreign).weights).all()
+        except ValueError as error:
+            refused.append(str(error))
+    assert len(refused) > 100
+    assert all("Write it anew" in one and "\n" not in one for one in refused)
+
+
+def test_with_the_largest_weights_predictions_and_flights_are_finite(tmp_path):
+    path, rng = tmp_path / "large.npz", np.random.default_rng(0)
+    weights = rng.choice([-1e3, 1e3], size=anticipation.count_weights(256, 256, N)).astype(np.float32)
+    Predictor(weights, 256, 256, N, DT).save(path)
+    swarm = Swarm(make_config("flight-v2", n_robots=4, predictor=str(path)))
+    place(swarm)
+    assert np.isfinite(believed(swarm, list(range(N)))).all()
+    for _ in range(5):
+        swarm.step(np.zeros((1, 4, 3), bool))
+    assert np.isfinite(swarm.state).all()
+    assert np.isfinite(swarm.plans).all()
 
 
 def test_a_field_that_is_missing_is_named(tmp_path):
