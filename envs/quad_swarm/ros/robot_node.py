@@ -243,6 +243,11 @@ class RobotNode:
         sensed = loop.ready()
         if absent := self._link.absent():
             raise ValueError(f"{absent[0]} does not listen: configure all robots first")
+        if unheard := self._vehicle.unheard():
+            raise ValueError(
+                f"nobody receives {', '.join(unheard)}: start what flies the vehicle, with the same middleware, and "
+                f"compare both ends by `ros2 topic info -v {unheard[0]}`"
+            )
         own = sensed.state[POSITION].copy()
         goal, first = own if self._goal is None else self._goal, loop.link.now() + loop.robot.period
         loop.start(own, goal, first, heading=float(sensed.state[8]))

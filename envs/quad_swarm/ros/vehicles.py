@@ -74,6 +74,7 @@ class TeamVehicle:
         self._convert = convert
         self._others = [number for number in range(len(names)) if number != link.index]
         self._commanded = link.now()
+        self._publishers: dict[str, Any] = {}
         raw = kind is msgs().Odometry
         self._topics = [mailbox.newest(kind, f"/{name}/{topic}", raw) for name in names]
 
@@ -128,7 +129,14 @@ class TeamVehicle:
         return self._link.shared(self._link.now())
 
     def _publisher(self, kind: type, topic: str) -> Any:
-        return self._node.create_publisher(kind, f"/{self._name}/{topic}", quality(1, reliable=True))
+        topic = f"/{self._name}/{topic}"
+        self._publishers[topic] = self._node.create_publisher(kind, topic, quality(1, reliable=True))
+        return self._publishers[topic]
+
+    def unheard(self) -> list[str]:
+        """Return the topics of commands that nobody receives: without a subscriber whose type, quality of service and
+        middleware fit."""
+        return [topic for topic, one in self._publishers.items() if not one.get_subscription_count()]
 
 
 class OdometryVehicle(TeamVehicle):

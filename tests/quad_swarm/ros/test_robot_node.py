@@ -134,6 +134,13 @@ def see(robot, age=0, height=1.5):
         robot._vehicle._states[k] = monotonic() - age, state
 
 
+def hear(robot, node):
+    """Let a node receive the robot's commands."""
+    node.create_subscription(msgs().TwistStamped, "/robot_0/cmd", lambda message: None, 10)
+    while robot._vehicle.unheard():
+        robot._mailbox.wait(monotonic() + 10_000, robot.loop)
+
+
 def goal(x, y, z, frame="map"):
     message = msgs().PoseStamped()
     message.header.frame_id = frame
@@ -165,6 +172,9 @@ def test_a_robot_begins_to_fly_in_the_air_if_it_sees_everybody(make, transitions
     other.create_subscription(msgs().Header, "/robot_1/plan_requests", lambda message: None, quality(2))
     while robot._link.absent():
         robot._mailbox.wait(monotonic() + 10_000, robot.loop)
+    see(robot)
+    assert "nobody receives /robot_0/cmd: start what flies the vehicle" in refused()
+    hear(robot, other)
     see(robot, height=9.0)
     assert "outside the fence" in refused()
     see(robot)
@@ -226,6 +236,7 @@ def test_a_robot_that_has_landed_is_inactive_and_may_begin_again(make, transitio
     other.create_subscription(msgs().Header, "/robot_1/plan_requests", lambda message: None, quality(2))
     while robot._link.absent():
         robot._mailbox.wait(monotonic() + 10_000, robot.loop)
+    hear(robot, other)
     assert not robot._take_wish(None, Trigger.Response()).success, "it does not fly"
     for _ in range(2):
         see(robot)

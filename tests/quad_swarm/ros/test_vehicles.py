@@ -119,7 +119,7 @@ class Node:
     """Keeps what is published, and receives what is handed to it. It is its own mailbox."""
 
     def __init__(self):
-        self.published, self.newer = {}, {}
+        self.published, self.newer, self.heard = {}, {}, set()
 
     def create_publisher(self, kind, topic, profile):
         published = self.published.setdefault(topic, [])
@@ -128,7 +128,7 @@ class Node:
             assert type(message) is kind
             published.append(message)
 
-        return SimpleNamespace(publish=publish)
+        return SimpleNamespace(publish=publish, get_subscription_count=lambda: int(topic in self.heard))
 
     def newest(self, kind, topic, raw=False):
         self.newer[topic] = kind, []
@@ -168,6 +168,13 @@ def test_a_twist_has_the_axes_that_are_named(twist):
     np.testing.assert_allclose(sensed.vel, STATES[1:, 3:6], atol=1e-12)
     vehicle.command(np.array([0.1, 0.2, 0.3, 0.0]), None)
     assert len(node.published["/robot_0/cmd"]) == 1
+
+
+def test_commands_that_nobody_receives_are_named():
+    vehicle, node, _ = make(vehicles.OdometryVehicle)
+    assert vehicle.unheard() == ["/robot_0/cmd"]
+    node.heard.add("/robot_0/cmd")
+    assert vehicle.unheard() == []
 
 
 def test_other_axes_are_refused():
