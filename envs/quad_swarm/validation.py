@@ -341,7 +341,9 @@ def read_assignments(option: str, assignments: Iterable[str]) -> dict[str, Any]:
             if not isinstance(place, dict):
                 raise ValueError(f"{option} {assignment!r}: {parent!r} already has a plain value.")
         if leaf in place:
-            raise ValueError(f"{option} {assignment!r}: {name!r} is given twice.")
+            raise ValueError(
+                f"{option} {assignment!r}: {name!r} is given twice, before as {shown(place[leaf])}: leave one out."
+            )
         try:
             place[leaf] = read_yaml(value)
         except ValueError as error:

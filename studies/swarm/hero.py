@@ -1,10 +1,10 @@
 """Render the README's animation: ``python -m studies.swarm.hero --policy none full MODEL.zip [--out DIR]``.
 
-All policies fly the same held-out episode. The page of `sb3-maddpg replay` draws each frame in a headless Chromium with
-its function ``renderFrame(seconds)``, so frames do not depend on the machine's speed. This writes ``hero-light.webp``
-and ``hero-dark.webp``; the README's with ``--preset flight --policy none full``, and
-``envs/quad_swarm/models/quad-swarm-flight/model.zip``. It needs Playwright (extra `dev`) and Chromium; software
-rendering suffices.
+All policies fly the same held-out episode, the first ``--without-predictor`` of them at constant velocities. The page
+of `sb3-maddpg replay` draws each frame in a headless Chromium with its function ``renderFrame(seconds)``, so frames do
+not depend on the machine's speed. This writes ``hero-light.webp`` and ``hero-dark.webp``; the README's with ``--preset
+flight-v3 --policy none full envs/quad_swarm/models/quad-swarm-flight-v3/model.zip --without-predictor 1 --episode 0``.
+It needs Playwright (extra `dev`) and Chromium; software rendering suffices.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from tqdm import tqdm
 from quad_swarm.evaluation.command import add_policy_arguments, make_conditions
 from quad_swarm.evaluation.rows import check_writable
 from quad_swarm.figures.replay import replay_page
+from quad_swarm.world.presets import make_config
 from studies.swarm.protocol import ROOT
 
 THEMES = ("light", "dark")
@@ -100,8 +102,12 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=0.5, help="speed of the flight (default 0.5: half of real time)")
     parser.add_argument("--seconds", type=float, help="seconds of the flight to show (default: until all have arrived)")
     parser.add_argument("--quality", type=int, default=70, help="quality of the WebP (default 70)")
+    parser.add_argument("--without-predictor", type=int, default=0, metavar="N", help="number of policies (default 0)")
     args = parser.parse_args()
-    conditions = make_conditions(args, [args.scenario])
+    conditions = [
+        replace(one, config=make_config(one.config, {"predictor": None})) if number < args.without_predictor else one
+        for number, one in enumerate(make_conditions(args, [args.scenario]))
+    ]
     for theme in THEMES:
         check_writable(args.out / f"{args.name}-{theme}.webp", "--out")
     page = replay_page(conditions, args.seed, args.episode, args.preset)

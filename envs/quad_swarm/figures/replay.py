@@ -51,7 +51,7 @@ def replay_page(
 ) -> str:
     """Fly an episode with several policies and create its web page.
 
-    :param conditions: policies in the same scenario and world
+    :param conditions: policies in the same scenario and world, which may differ in the predictor
     :param seed: index of the set of held-out episodes
     :param episode: index of the episode in the set
     :param preset: name of the world on the page
@@ -119,6 +119,11 @@ def _live_obstacles(step: dict[str, Any]) -> dict[str, Any]:
 
 
 def _page(about: dict[str, Any], config: SwarmConfig, dt: float, flights: Iterable[tuple[str, Flight]]) -> str:
+    flown = list(flights)
+    described = [_describe(policy, flight) for policy, flight in flown]
+    if len({flight.config.predictor for _, flight in flown}) > 1:
+        for one, (_, flight) in zip(described, flown, strict=True):
+            one["detail"] = "others at constant velocity" if flight.config.predictor is None else "others predicted"
     data = {
         **about,
         "dt": dt,
@@ -129,7 +134,7 @@ def _page(about: dict[str, Any], config: SwarmConfig, dt: float, flights: Iterab
         "collision_distance": 2 * config.radius,
         **({"downwash": config.planner.downwash} if config.planner.downwash != 1 else {}),
         "colours": COLOURS,
-        "flights": [_describe(policy, flight) for policy, flight in flights],
+        "flights": described,
     }
     # "</script>" in the name of a policy would end the data
     text = json.dumps(data, separators=(",", ":")).replace("<", "\u003c")
@@ -152,6 +157,7 @@ def _describe(policy: str, flight: Flight) -> dict[str, Any]:
     name, detail = _plain_name(policy)
     return {
         "policy": short_name(policy),
+        "predicts": flight.config.predictor is not None,
         "name": name,
         "detail": detail,
         "positions": flight.pos[: end + 1].round(_DIGITS).tolist(),

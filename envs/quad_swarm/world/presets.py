@@ -475,8 +475,8 @@ class SwarmConfig:
         if beyond.max(initial=0.0) > self._leeway:
             worst = int(beyond.argmax())
             raise ValueError(
-                f"{name}[{worst}]={places[worst].tolist()} is {beyond[worst]:.3g} m outside the workspace, "
-                f"planner.workspace_low={self.planner.workspace_low} to "
+                f"{name}[{worst}]={np.round(places[worst], 3).tolist()} is {beyond[worst]:.3g} m outside the "
+                f"workspace, planner.workspace_low={self.planner.workspace_low} to "
                 f"planner.workspace_high={self.planner.workspace_high}: choose a point inside, or enlarge it"
             )
 
@@ -526,7 +526,7 @@ class SwarmConfig:
             distance = float(found[robot, number])
             where = f"{distance:.3g} m from the surface of" if distance >= 0 else f"{-distance:.3g} m inside"
             raise ValueError(
-                f"{name}[{robot}]={places[robot].tolist()} is {where} obstacle {number} (radius "
+                f"{name}[{robot}]={np.round(places[robot], 3).tolist()} is {where} obstacle {number} (radius "
                 f"{around.radius[number]:.3g} m, centre {np.round(around.position[number], 3).tolist()}), where {why}: "
                 f"choose a point at least {kept[robot % len(kept)]:.3g} m from its surface"
             )
@@ -707,7 +707,7 @@ def make_config(
 
     :param preset: a name of `PRESETS`, or a world
     :param world: fields of `SwarmConfig` to replace, nested ones as mappings
-    :param overrides: further fields by name; None keeps the preset's value
+    :param overrides: further fields by name; None keeps the preset's value, so None itself is given in `world`
     :raises ValueError: if the preset or a field is unknown, a value is out of range, or a field is given twice
     """
     if not isinstance(preset, SwarmConfig) and (not isinstance(preset, str) or preset not in PRESETS):

@@ -67,7 +67,7 @@ export const metres = distance => `${distance.toFixed(Math.abs(distance - contac
 export const grouped = number => String(number).replace(/\B(?=(\d{3})+$)/g, "\u202f");
 export function percent(part, whole) {
   const share = 100 * part / whole;
-  return `${share === 0 || share >= 99.95 ? share.toFixed(0) : share.toFixed(1)}\u00a0%`;
+  return `${share.toFixed(share === 0 || share >= 99.95 ? 0 : share < 0.1 ? 2 : 1)}\u00a0%`;
 }
 
 // Okabe and Ito's colours; after eight they repeat, darker and then lighter.

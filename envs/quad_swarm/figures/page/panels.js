@@ -115,8 +115,13 @@ export const legend = [
   ["bubble alarm", "collision"],
 ];
 
+const predicting = flights.filter(flight => flight.predicts).length;
+const expected = predicting === flights.length ? "it expects what a small network predicts" : predicting === 0
+  ? "it expects that they fly straight on"
+  : "it expects that they fly straight on, or what a small network predicts (\u201cothers predicted\u201d)";
+
 export const about = `${nRobots} quadrotors fly from where they start to the rings of their colours. Each plans its own path every ` +
-  `${seconds(1, 2)} and may ask others for their plans; of those it does not ask it assumes that they fly straight on. ` +
+  `${seconds(1, 2)} and may ask others for their plans; of those it does not ask, ${expected}. ` +
   `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A plan is sent in answer to each request that arrives` +
   `${flights.some(flight => flight.announces) ? ", or announced without one" : ""}.` +
   (obstacles.length ? " All know the obstacles: where they are, how large, and how fast." : "") +
