@@ -100,7 +100,8 @@ def write_settings(path: Path, values: Mapping[str, Any]) -> None:
     :param values: its content, plain values and tuples
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(yaml.dump(dict(sorted(as_yaml(values).items())), Dumper=_Dumper))
+    # The keys within a value keep their order, which an environment may count on
+    path.write_text(yaml.dump(dict(sorted(as_yaml(values).items())), Dumper=_Dumper, sort_keys=False))
 
 
 def as_yaml(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -307,7 +307,7 @@ class Search:
         params = _arguments_of(study.best_trial, self.args)
         recipe = as_yaml(merged(self.experiment.recipe, params))
         with atomic_write(path, "yml") as file:
-            file.write(yaml.safe_dump({self.args.env: recipe}).encode())
+            file.write(yaml.safe_dump({self.args.env: recipe}, sort_keys=False).encode())
         tell_best(self.args.algo, self.args.env, path)
 
 

@@ -431,7 +431,7 @@ class ScenarioSampler:
 
     :param name: a name of `SCENARIOS`; "mixed" to draw uniformly among `without_obstacles`; "curriculum" to draw
         uniformly among the first ``level + 1`` of them; or a mapping of names to weights, such as
-        ``{"symmetric_swap": 3, "random": 1}``
+        ``{"symmetric_swap": 3, "random": 1}``, in any order
     :param n_robots: number of robots, at least 2
     :param space: the room
     :param world: the world that the episodes are flown in, whose `SwarmConfig.check_flight` then holds for each of them
@@ -449,6 +449,8 @@ class ScenarioSampler:
         for one in [name] if isinstance(name, str) else name:
             if one not in SCENARIOS and (one not in MIXTURES or not isinstance(name, str)):
                 raise unknown_name("scenario", one, [*SCENARIOS, *MIXTURES])
+        if not isinstance(name, str):  # equal mappings draw the same: files sort their keys
+            name = dict(sorted(name.items()))
         weights = [] if isinstance(name, str) else [float(weight) for weight in name.values()]
         if not isinstance(name, str) and not (all(weight >= 0 for weight in weights) and 0 < sum(weights) < np.inf):
             raise ValueError(

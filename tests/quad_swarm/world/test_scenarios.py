@@ -139,6 +139,17 @@ def test_weights_are_shares():
     assert sampler.n_levels == 1
 
 
+def test_equal_mixtures_draw_the_same_in_any_order():
+    """The file of a run has its keys in another order than the recipe, and a resumed run reads that file."""
+    weights = {"symmetric_swap": 3, "asymmetric_swap": 1, "random": 2}
+    drawn = []
+    for mixture in (weights, dict(reversed(weights.items()))):
+        sampler, rng = ScenarioSampler(mixture, 3, SPACE), np.random.default_rng(0)
+        drawn.append([sampler.sample(rng)[0] for _ in range(50)])
+    assert drawn[0] == drawn[1]
+    assert set(drawn[0]) == set(weights)
+
+
 @pytest.mark.parametrize(
     ("weights", "message"),
     [

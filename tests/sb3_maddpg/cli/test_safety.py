@@ -15,7 +15,7 @@ import yaml
 
 from sb3_maddpg.cli.environments import Environments
 from sb3_maddpg.cli.main import main
-from sb3_maddpg.cli.safety import RunLoader, check_names
+from sb3_maddpg.cli.safety import RunLoader, check_names, read_settings, write_settings
 
 SHORT = ["--env", "OwnBit-v0", "-n", "60", "-params", "learning_starts:20", "buffer_size:500", "--eval-freq", "-1"]
 SPREAD = "mpe2/simple_spread_v3"
@@ -52,6 +52,16 @@ def poison(model: Path) -> None:
 def test_the_folder_of_a_run_is_read(run, capsys):
     assert main(["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"]) == 0
     assert "Mean reward" in capsys.readouterr().out
+
+
+def test_settings_are_read_as_they_were_written(tmp_path):
+    """The keys of a value in their order, too: an environment may name its agents by them."""
+    written = {"policy": "MlpPolicy", "env_kwargs": {"agents": {"zoe": 1, "adam": (2.0, None)}}}
+    write_settings(tmp_path / "config.yml", written)
+    read = read_settings(tmp_path / "config.yml")
+    assert list(read) == sorted(written)
+    assert list(read["env_kwargs"]["agents"]) == ["zoe", "adam"]
+    assert read["env_kwargs"] == written["env_kwargs"]
 
 
 @pytest.mark.parametrize("name", ["config.yml", "args.yml"])
