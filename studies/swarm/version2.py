@@ -30,10 +30,11 @@ threshold is; set 719 ``lacking_eight``, what full communication of eight lacks 
 robots: the packaged model of version 2, nobody, everybody, and a rule that tells; set 723 ``third_hard``,
 ``third_hummingbird``, ``third_crazyflie`` and ``third_many``, these in the disturbances of `flight-hard`, in the
 foreign simulators, and with 24 and 32 robots; set 724 ``third_seeds_SIZE``, all scenarios in `flight-v3` with the
-recipe's other training seeds. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before robots
-of version 3 kept right of predicted others; set 721 never flew. All parts before set 706 fly with equal penalties,
-those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and number of robots with the
-keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
+recipe's other training seeds; set 726 ``third_random_SIZE``, robots that ask at random about as often as the model
+sends. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before robots of version 3 kept right
+of predicted others; set 721 never flew. All parts before set 706 fly with equal penalties, those before set 709 without
+the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written
+after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -59,7 +60,14 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS = 713, *range(715, 720), 722, 723, 724
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE = (
+    713,
+    *range(715, 720),
+    722,
+    723,
+    724,
+    726,
+)
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -209,6 +217,11 @@ PARTS |= {
 PARTS |= {
     f"third_seeds_{size}": Part(BOLDER_SEEDS, EVERYWHERE, (n,), 500, OTHERS, preset="flight-v3")
     for size, n in SIZES.items()
+}
+# As often as the model sends on average with sixteen robots in set 722, or more
+PARTS |= {
+    f"third_random_{size}": Part(("random:0.003",), EVERYWHERE, (SIZES[size],), 2000, CHANCE, preset="flight-v3")
+    for size in ("twelve", "sixteen")
 }
 _THREE = tuple(THIRD_POLICIES[what] for what in ("full", "none", "model"))
 PARTS |= {

@@ -53,9 +53,10 @@ def test_sets_of_episodes_are_apart():
         version2.LACKING,
         version2.THIRD,
         version2.OTHERS,
+        version2.CHANCE,
         version2.ELSEWHERE,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 27
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 28
 
 
 def test_the_table_at_a_glance_says_what_it_costs():

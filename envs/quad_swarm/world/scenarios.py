@@ -449,8 +449,7 @@ class ScenarioSampler:
         for one in [name] if isinstance(name, str) else name:
             if one not in SCENARIOS and (one not in MIXTURES or not isinstance(name, str)):
                 raise unknown_name("scenario", one, [*SCENARIOS, *MIXTURES])
-        if not isinstance(name, str):  # equal mappings draw the same: files sort their keys
-            name = dict(sorted(name.items()))
+        name = name if isinstance(name, str) else dict(sorted(name.items()))  # equal mappings draw the same
         weights = [] if isinstance(name, str) else [float(weight) for weight in name.values()]
         if not isinstance(name, str) and not (all(weight >= 0 for weight in weights) and 0 < sum(weights) < np.inf):
             raise ValueError(
