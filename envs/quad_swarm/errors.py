@@ -20,15 +20,17 @@ def shown(value: object, most: int = 200) -> str:
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 3) :]}"
 
 
-def unknown_name(kind: str, value: object, known: Iterable[str]) -> ValueError:
+def unknown_name(kind: str, value: object, known: Iterable[str], meant: str | None = None) -> ValueError:
     """Create the error for an unknown name, which lists the known names and suggests the closest one.
 
     :param kind: kind of the name, e.g. ``"scenario"``
     :param value: the unknown name
     :param known: the known names
+    :param meant: the known name that the unknown one stands for; by default, the one that is spelled most alike
     """
     names = sorted(known)
-    near = difflib.get_close_matches(value if isinstance(value, str) else shown(value), names, n=1, cutoff=0.4)
+    text = value if isinstance(value, str) else shown(value)
+    near = [meant] if meant else difflib.get_close_matches(text, names, n=1, cutoff=0.4)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return ValueError(f"Unknown {kind} {shown(value)}; known: {', '.join(names)}.{hint}")
 

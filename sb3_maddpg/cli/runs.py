@@ -80,7 +80,8 @@ def latest_model(word: str, algo: str, env_id: str) -> str:
                 return str(model)
     raise FileNotFoundError(
         f"{word}: no trained model of {algo} for {env_id} in {folder}. Train one with "
-        f"`{PROG} train --algo {algo} --env {env_id} --log-folder {folder.parent}`."
+        f"`{PROG} train --algo {algo} --env {env_id} --log-folder {folder.parent}`, with `--conf-file` for a recipe "
+        "of another world than the default one."
     )
 
 

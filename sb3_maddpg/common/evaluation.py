@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +18,6 @@ from sb3_maddpg.utils import suggest
 from sb3_maddpg.vec_env.wrap import as_vec_env
 
 MEAN_REWARD, SUCCESS_RATE = "mean_reward", "success_rate"  # what ``best_by`` may name beside agents
-_RESAMPLES = 10_000
-_MOST_AT_ONCE = 10_000_000  # numbers of a bootstrap
 
 
 class Episode(NamedTuple):
@@ -116,19 +115,40 @@ def play(policy: Any, env: VecEnv, n_episodes: int, seed: int = 0, deterministic
 def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
     """
     :param values: one value per episode, or per training
-    :return: their mean, and its 95 % interval by the bootstrap (percentiles of 10,000 resamples, always the same ones),
-        NaN for a single value
+    :return: their mean, and its 95 % interval by Student's t distribution, NaN for a single value
     """
     array = np.asarray(values, np.float64)
-    if len(array) < 2:
-        return float(array.mean()) if len(array) else math.nan, math.nan, math.nan
-    rng, means = np.random.default_rng(0), []
-    at_once = max(1, _MOST_AT_ONCE // len(array))
-    for first in range(0, _RESAMPLES, at_once):
-        count = min(at_once, _RESAMPLES - first)
-        means.append(array[rng.integers(0, len(array), (count, len(array)))].mean(axis=1))
-    low, high = np.quantile(np.concatenate(means), (0.025, 0.975))
-    return float(array.mean()), float(low), float(high)
+    mean, n = (float(array.mean()), len(array)) if len(array) else (math.nan, 0)
+    if n < 2:
+        return mean, math.nan, math.nan
+    half = _t_quantile(n - 1) * float(array.std(ddof=1)) / math.sqrt(n)
+    return mean, mean - half, mean + half
+
+
+def _t_quantile(df: int) -> float:
+    """:return: the 97.5 % quantile of Student's t distribution, by the expansion of Fisher and Cornish (1960)"""
+    if df <= 2:
+        return (12.70620473617471, 4.302652729749464)[df - 1]
+    z, n = NormalDist().inv_cdf(0.975), float(df)
+    terms = (
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
+    )
+    return z + sum(term / n ** (k + 1) for k, term in enumerate(terms))
+
+
+def share_interval(count: int, n: int) -> tuple[float, float, float]:
+    """
+    :param count: number of successes
+    :param n: number of trials, at least 1
+    :return: their share, and its 95 % interval (Wilson's)
+    """
+    share, z = count / n, NormalDist().inv_cdf(0.975)
+    centre, spread = share + z * z / (2 * n), z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    low, high = ((centre + sign * spread) / (1 + z * z / n) for sign in (-1, 1))
+    return share, max(0.0, low), min(1.0, high)
 
 
 def summarise(episodes: Sequence[Episode]) -> dict[str, Any]:
@@ -143,7 +163,9 @@ def summarise(episodes: Sequence[Episode]) -> dict[str, Any]:
         "length": _figure([one.length for one in episodes]),
     }
     if successes := [float(one.success) for one in episodes if one.success is not None]:
-        found["success_rate"] = _figure(successes)
+        found["success_rate"] = dict(
+            zip(("mean", "low", "high"), share_interval(int(sum(successes)), len(successes)), strict=True)
+        )
     found["agents"] = {
         name: {
             "return": _figure([one.returns[name] for one in episodes]),

@@ -156,12 +156,13 @@ def _check_room(config: SwarmConfig, limits: SafetyLimits) -> None:
         gap, name = gaps[corner, axis], ("workspace_low", "workspace_high")[corner]
         low = np.maximum(planner.workspace_low, np.add(limits.room[0], least[0])).round(3).tolist()
         high = np.minimum(planner.workspace_high, np.subtract(limits.room[1], least[1])).round(3).tolist()
+        slower_stops = axis < 2 and gap > limits.fence + config.radius
         raise ValueError(
             f"limits.room: {gap:.3g} m between planner.{name}[{axis}]={getattr(planner, name)[axis]:g} and the "
             f"{'ceiling' if axis == 2 else 'wall'} at {limits.room[corner][axis]:g}, but a robot that is noticed at "
             f"the fence ({limits.fence:g} m) needs {needed[axis]:.3g} m to stop: give planner.workspace_low={low} and "
             f"planner.workspace_high={high}"
-            + (f", or planner.max_speed below {planner.max_speed:g}" if axis < 2 and gap > limits.fence else "")
+            + (f", or planner.max_speed below {planner.max_speed:g}" if slower_stops else "")
             + (", or a lower limits.fence" if needed[axis] - limits.fence < gap else "")
         )
 

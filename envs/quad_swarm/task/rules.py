@@ -188,6 +188,10 @@ def _either(alternatives: list[list[Rule]]) -> Rule:
     return rule
 
 
+# Whoever sends, in the words of tables
+_MEANT = {"nobody": "none", "everybody": "full"}
+
+
 def _parse_one(text: str, instead: Mapping[str, Callable[..., Rule]] = MappingProxyType({})) -> Rule:
     """Parse a rule without operators.
 
@@ -195,7 +199,7 @@ def _parse_one(text: str, instead: Mapping[str, Callable[..., Rule]] = MappingPr
     """
     name, *values = text.split(":")
     if name not in RULES:
-        raise unknown_name("rule", name, RULES)
+        raise unknown_name("rule", name, RULES, _MEANT.get(name))
     factory, arguments = RULES[name]
     factory = instead.get(name, factory)
     usage = ":".join((name, *arguments))

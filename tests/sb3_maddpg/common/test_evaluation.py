@@ -11,7 +11,15 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_maddpg import MADDPG, TeamEnv, make_vec_env
-from sb3_maddpg.common.evaluation import Episode, TeamEvalCallback, compare, mean_interval, play, summarise
+from sb3_maddpg.common.evaluation import (
+    Episode,
+    TeamEvalCallback,
+    compare,
+    mean_interval,
+    play,
+    share_interval,
+    summarise,
+)
 from sb3_maddpg.team.toys import OwnBit
 from toys import SMALL, Toy
 
@@ -72,13 +80,25 @@ def test_only_one_environment_can_be_played():
         next(play(None, DummyVecEnv([OwnBit, OwnBit]), 1))
 
 
-def test_an_interval_holds_the_mean_in_about_95_of_100_samples():
+@pytest.mark.parametrize("n", [2, 3, 5, 60])
+def test_an_interval_holds_the_mean_in_about_95_of_100_samples(n):
     rng, hits = np.random.default_rng(0), 0
-    for _ in range(200):
-        mean, low, high = mean_interval(rng.normal(3.0, 2.0, 60))
+    for _ in range(1000):
+        mean, low, high = mean_interval(rng.normal(3.0, 2.0, n))
         assert low < mean < high
         hits += low <= 3.0 <= high
-    assert 180 <= hits <= 198
+    assert 930 <= hits <= 970
+
+
+def test_intervals_of_known_samples():
+    """By SciPy's t and by Wilson (1927)."""
+    for n, quantile in ((2, 12.7062), (3, 4.3027), (4, 3.1824), (6, 2.5706), (31, 2.0423)):
+        _, low, high = mean_interval(np.resize([0.0, 1.0], n))
+        half = quantile * np.resize([0.0, 1.0], n).std(ddof=1) / np.sqrt(n)
+        assert (high - low) / 2 == pytest.approx(half, rel=2e-3)
+    assert share_interval(0, 100) == pytest.approx((0, 0, 0.0370), abs=1e-4)
+    assert share_interval(3, 4) == pytest.approx((0.75, 0.3006, 0.9544), abs=1e-4)
+    assert share_interval(5, 5)[1:] == pytest.approx((0.5655, 1.0), abs=1e-4)
     assert mean_interval([2.0])[0] == 2.0
     assert np.isnan(mean_interval([2.0])[1:]).all()
     assert mean_interval([1.0, 1.0, 1.0]) == (1.0, 1.0, 1.0)
