@@ -90,6 +90,7 @@ PARAMETERS: dict[str, Any] = {
     # Of vehicles, which need some of them
     "odom_topic": "odom",
     "twist": "body",
+    "poses": "",
     "origins": [],
     "most_thrust": 0.0,
     "gains": [],
@@ -123,7 +124,10 @@ def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[st
     }
     if values["vehicle"] not in makers:
         raise unknown_name("vehicle", values["vehicle"], makers)
-    return makers[values["vehicle"]]()
+    vehicle = makers[values["vehicle"]]()
+    if values["poses"]:
+        vehicle.watch_poses(values["poses"])
+    return vehicle
 
 
 def check_walls(world: Sequence[str], limits: Mapping[str, Any]) -> None:

@@ -37,6 +37,7 @@ from quad_swarm.ros.messages import FRAME, from_odometry, msgs, rotation, to_com
 from quad_swarm.ros.node import Mailbox, quality
 
 _S = 1_000_000
+_UNSEEN, _ASTRAY = 100_000, 0.3  # since a robot was seen last (us), and how far from there its state may be (m)
 _CRAZYFLIE_THRUST, _CRAZYFLIE_MOST = 65535, 60000
 _PX4_NED, _PX4_BODY_FRD = 1, 3
 _PX4_SET_MODE, _PX4_ARM, _PX4_OFFBOARD = 176, 400, 6
@@ -69,6 +70,9 @@ class TeamVehicle:
         controller: AttitudeController | None = None,
     ):
         self._node, self._link, self._name = node, link, names[link.index]
+        self._mailbox, self._names = mailbox, list(names)
+        self._captures: Callable[[], Any] | None = None
+        self._captured: dict[str, tuple[int, np.ndarray]] = {}
         self.controller = controller or AttitudeController()
         self._states: dict[int, tuple[int, np.ndarray]] = {}
         self._convert = convert
@@ -77,6 +81,16 @@ class TeamVehicle:
         self._publishers: dict[str, Any] = {}
         raw = kind is msgs().Odometry
         self._topics = [mailbox.newest(kind, f"/{name}/{topic}", raw) for name in names]
+
+    def watch_poses(self, topic: str) -> None:
+        """Let states count only of robots that motion capture sees, and only where it sees them. An estimator on board
+        goes on without its markers, and drifts, with states that are new: what it says now grows old instead.
+
+        :param topic: poses by the robots' names (motion_capture_tracking_interfaces/NamedPoseArray), such as "/poses"
+        :raises ImportError: if the package of its messages is not there
+        """
+        kind = _class("motion_capture_tracking_interfaces", "NamedPoseArray")
+        self._captures = self._mailbox.newest(kind, topic)
 
     def sense(self) -> Sensed | None:
         """See `quad_swarm.realtime.Vehicle`. The others are moved to the time of the robot's own state."""
@@ -102,6 +116,7 @@ class TeamVehicle:
 
     def _seen(self) -> dict[int, tuple[int, np.ndarray]]:
         """Take what has arrived. Returns the newest states by robot."""
+        self._take_poses()
         for number, newest in enumerate(self._topics):
             try:
                 message = newest()
@@ -111,8 +126,18 @@ class TeamVehicle:
                 self._link.traffic.refused += 1
         return self._states
 
+    def _take_poses(self) -> None:
+        message = None if self._captures is None else self._captures()
+        for one in () if message is None else message.poses:
+            place = one.pose.position
+            self._captured[one.name] = self._link.now(), np.array([place.x, place.y, place.z])
+
     def _see(self, number: int, stamp: int, state: np.ndarray) -> None:
         """Keep the newest state of a robot, with the time on this robot's clock."""
+        if self._captures is not None:
+            at, place = self._captured.get(self._names[number], (0, np.full(3, np.inf)))
+            if self._link.now() - at > _UNSEEN or not np.linalg.norm(state[POSITION] - place) <= _ASTRAY:
+                raise ValueError(f"motion capture does not see {self._names[number]} there")
         stamp = self._link.own(stamp) + self._link.clock_error
         if number not in self._states or stamp > self._states[number][0]:
             self._states[number] = stamp, state

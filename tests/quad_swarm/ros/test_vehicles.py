@@ -31,7 +31,7 @@ NAMES = names_of(2)
 PERIOD = 50_000
 
 
-def kind(name, version=0, **fields):
+def kind(name, version=0, /, **fields):
     """A class of messages: fields by name, with the value that they have at first."""
 
     def __init__(self, **values):
@@ -58,6 +58,10 @@ def floats(n):
 
 PACKAGES = {
     "crazyflie_interfaces": [kind("FullState", header=Header, pose=Pose, twist=Twist, acc=Vector3)],
+    "motion_capture_tracking_interfaces": [
+        kind("NamedPose", name="", pose=Pose),
+        kind("NamedPoseArray", header=Header, poses=list),
+    ],
     "as2_msgs": [kind("Thrust", header=Header, thrust=0.0, thrust_normalized=0.0)],
     "px4_msgs": [
         kind(
@@ -168,6 +172,35 @@ def test_a_twist_has_the_axes_that_are_named(twist):
     np.testing.assert_allclose(sensed.vel, STATES[1:, 3:6], atol=1e-12)
     vehicle.command(np.array([0.1, 0.2, 0.3, 0.0]), None)
     assert len(node.published["/robot_0/cmd"]) == 1
+
+
+def test_states_grow_old_of_robots_that_motion_capture_does_not_see(packages):
+    """The estimator on board goes on without its markers: states are new, and drift."""
+    vehicle, node, link = make(vehicles.CrazyswarmVehicle, period=PERIOD)
+    vehicle.watch_poses("/poses")
+
+    def step(*captured):
+        link.time += 50_000
+        message = packages.NamedPoseArray()
+        for name, place in captured:
+            one = packages.NamedPose(name=name)
+            one.pose.position.x, one.pose.position.y, one.pose.position.z = map(float, place)
+            message.poses.append(one)
+        node.receive("/poses", message)
+        seen(node, link, STATES, world=True)
+        sensed = vehicle.sense()
+        return None if sensed is None else link.now() - sensed.stamp
+
+    own, other = zip(NAMES, STATES[:, :3], strict=True)
+    assert step(own) is None, "the other one has never been seen"
+    assert step(own, other) == 0
+    assert [step(other) for _ in range(4)] == [0, 0, 50_000, 100_000], "it counts for a tenth of a second"
+    assert step(own, other) == 0
+    aside = own[0], own[1] + [0.4, 0, 0]
+    assert [step(aside, other) for _ in range(2)] == [50_000, 100_000], "it is seen elsewhere"
+    assert step((own[0], own[1] + [0.2, 0, 0]), other) == 0
+    assert step((own[0], [np.nan] * 3), other) == 50_000
+    assert link.traffic.refused == 6
 
 
 def test_commands_that_nobody_receives_are_named():
