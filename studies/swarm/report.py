@@ -581,6 +581,8 @@ def version_2_table(rows: Rows) -> str:
             if each[0]["policy"] in (*CHEAP_RULES, named(MASK_ONLY)):
                 continue
             times = sorted(float(one["steps_to_arrival"]) for one in each if one["steps_to_arrival"])
+            if 2 * merged(chosen)["collisions"] > merged(chosen)["episodes"]:  # only those arrive that met nobody
+                times = []
             lines.append(
                 [
                     str(n),
@@ -588,7 +590,7 @@ def version_2_table(rows: Rows) -> str:
                     seeds_rate([merged(chosen)]).replace("<br>", "&nbsp;"),
                     f"{min(row['min_separation_quantiles']['0.01'] for row in chosen):.2f}",
                     spread([f"{share:.1%}" for share in sorted(one["request_share"] for one in each)]),
-                    spread([f"{time:.0f}" for time in times]),
+                    spread([f"{time:.0f}" for time in times]) if times else "-",
                     ", ".join(map(str, sorted({row["set"] for row in chosen}))),
                 ]
             )
