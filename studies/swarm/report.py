@@ -629,38 +629,47 @@ def cells_table(rows: Rows) -> str:
 
 
 def front_table(second: Rows, third: Rows, page: str) -> str:
-    """Format the symmetric swap of eight robots at a glance: how others are predicted, who sends, what it costs.
+    """Format the symmetric swap of eight and sixteen robots at a glance: how others are predicted, who sends, what it
+    costs. A cell has the flights with a collision, their interval, the share of plans sent, and the time to arrival
+    beside full communication.
 
     :param second: rows of `studies.swarm.version2` in `flight-v2`
     :param third: those in `flight-v3`
     :param page: address of the planner's page
     """
 
-    def flown(rows: Rows, policy: str) -> dict[str, Any] | None:
-        here = [row for row in rows if hardest(row, 8) and row["plant"] == MODEL and row["set"] != ELSEWHERE]
+    def flown(rows: Rows, policy: str, n: int) -> dict[str, Any] | None:
+        here = [row for row in rows if hardest(row, n) and row["plant"] == MODEL and row["set"] != ELSEWHERE]
         chosen = [row for row in here if row["policy"] == named(policy)]
         return merged(chosen) if chosen else None
 
-    full, steady = flown(third, FULL), flown(second, "none")
-    assert full is not None
-    lines = []
-    for predicted, who, row in (
-        ("constant velocity (`flight-v2`)", "nobody", steady),
-        (f"[ORCA]({page}#without-messages-orca-and-voronoi-cells) (`flight-v2`)", "nobody", flown(second, ORCA)),
-        ("network (`flight-v3`)", "nobody", flown(third, "none")),
-        ("network (`flight-v3`)", f"rule `{THIRD_POLICIES['rule']}`", flown(third, THIRD_POLICIES["rule"])),
-        ("network (`flight-v3`)", "**learned**", flown(third, THIRD_POLICIES["model"])),
-        ("network (`flight-v3`)", "everybody", full),
-    ):
+    def cell(row: dict[str, Any] | None, full: dict[str, Any] | None) -> str:
         if row is None:
-            continue
-        later = f"{row['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%")
-        if row is steady:  # only those arrive that met nobody
-            later = "-"
-        elif row is full:
-            later = f"{full['steps_to_arrival'] * PRESETS['flight-v3'].planner.dt:.1f} s"
-        lines.append([predicted, who, seeds_rate([row]), f"{row['request_share']:.2%}", later])
-    return table(["others are predicted by", "who sends", "flights with a collision", "plans sent", "arrival"], lines)
+            return ""
+        parts = [seeds_rate([row]), f"{row['request_share']:.2%}&nbsp;sent"]
+        if row is full:
+            parts.append(f"{full['steps_to_arrival'] * PRESETS['flight-v3'].planner.dt:.1f}&nbsp;s")
+        # Of those that collide mostly, only those arrive that met nobody
+        elif full is not None and 2 * row["collisions"] < row["episodes"]:
+            parts.append(f"{row['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%"))
+        return "<br>".join([parts[0], ",&nbsp;".join(parts[1:])])
+
+    sizes = (8, 16)
+    everybody = {n: flown(third, FULL, n) for n in sizes}
+    orca = f"[ORCA]({page}#without-messages-orca-and-voronoi-cells) (`flight-v2`)"
+    lines = []
+    for predicted, who, rows, policy in (
+        ("constant velocity (`flight-v2`)", "nobody", second, "none"),
+        (orca, "nobody", second, ORCA),
+        ("network (`flight-v3`)", "nobody", third, "none"),
+        ("network (`flight-v3`)", f"rule `{THIRD_POLICIES['rule']}`", third, THIRD_POLICIES["rule"]),
+        ("network (`flight-v3`)", "**learned**", third, THIRD_POLICIES["model"]),
+        ("network (`flight-v3`)", "everybody", third, FULL),
+    ):
+        found = {n: everybody[n] if policy == FULL else flown(rows, policy, n) for n in sizes}
+        if any(found.values()):
+            lines.append([predicted, who, *(cell(found[n], everybody[n]) for n in sizes)])
+    return table(["others are predicted by", "who sends", "eight robots", "sixteen robots"], lines)
 
 
 def anticipation_table(rows: Rows) -> str:

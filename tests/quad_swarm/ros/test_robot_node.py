@@ -441,7 +441,8 @@ def test_the_file_of_the_walk_through_configures_a_robot_with_an_exported_policy
     monkeypatch.chdir(tmp_path)
     # Crazyswarm2's messages are no wheel
     assert parameters["poses"] == "/poses"
-    here = re.sub(r" *poses: /poses\n", "", text.replace("vehicle: crazyswarm", "vehicle: odometry")).replace("policy: full", "policy: robots")
+    here = text.replace("vehicle: crazyswarm", "vehicle: odometry").replace("policy: full", "policy: robots")
+    here = re.sub(r" *poses: /poses\n", "", here)
     Path("robots.yaml").write_text(here)
     node = RobotNode(["robot", "--ros-args", "-r", "__ns:=/cf1", "--params-file", "robots.yaml"])
     try:
