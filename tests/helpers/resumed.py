@@ -27,8 +27,17 @@ SWARM = {"preset": "flight", "n_robots": 3, "max_steps": 20}
 PAIRS = {**SWARM, "observation": "state+memory+plan+told+mask+critic"}
 
 
+MIXED = {"symmetric_swap": 2, "forest": 1, "crossing_traffic": 1}
+
+
 def swarms():
     return VecMonitor(GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=4, **PAIRS)))
+
+
+def predicting():
+    """Swarms that predict each other, with and without obstacles."""
+    kwargs = {**SWARM, "preset": "flight-v3", "scenario": MIXED, "observation": "state+approach+memory+plan+obstacles"}
+    return VecMonitor(GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=3, **kwargs)))
 
 
 def curriculum():
@@ -49,6 +58,7 @@ RUNS = {
         "PairPolicy",
         {"replay_buffer_class": PrioritizedTeamReplayBuffer, "n_steps": 3, "train_freq": 1},
     ),
+    "predicting": (predicting, "MlpPolicy", {"train_freq": 2}),
     "one swarm": (curriculum, "MlpPolicy", {"train_freq": 7}),
     "PettingZoo": (parallel, "MlpPolicy", {"train_freq": 5}),
     "replayed": (lambda: Replayable(OwnBit()), "MlpPolicy", {"train_freq": (1, "episode")}),

@@ -30,7 +30,12 @@ SWARM = {
     "batch_size": 16,
     "buffer_size": 1200,
     "train_freq": 2,
-    "env_kwargs": {"preset": "flight", "n_robots": 3, "max_steps": 20},
+    "env_kwargs": {
+        "preset": "flight-v3",
+        "n_robots": 3,
+        "max_steps": 20,
+        "scenario": {"symmetric_swap": 2, "forest": 1, "asymmetric_swap": 1},  # in no alphabetical order
+    },
 }
 OWN = {"n_timesteps": 6000, "policy": "MlpPolicy", "learning_starts": 200, "batch_size": 16, "buffer_size": 1200}
 RECIPES = {"QuadSwarm-v0": SWARM, "OwnBit-v0": {**OWN, "train_freq": 3, "normalize": "{'norm_reward': False}"}}
@@ -82,7 +87,7 @@ def test_killed_and_resumed_twice_a_run_ends_as_the_uninterrupted_one(env_id, tm
     argv += ["--eval-freq", "800", "--eval-episodes", "2", "--tensorboard-log", "tb"]
     for folder in (whole, parts):
         folder.mkdir()
-        (folder / "r.yml").write_text(yaml.safe_dump({env_id: RECIPES[env_id]}))
+        (folder / "r.yml").write_text(yaml.safe_dump({env_id: RECIPES[env_id]}, sort_keys=False))
     uninterrupted = start(argv, whole)
 
     process = start(argv, parts)
