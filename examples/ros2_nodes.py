@@ -37,7 +37,8 @@ class Operator:
                 (one,) = message.status
                 self.status[name] = {"message": one.message, **{pair.key: pair.value for pair in one.values}}
 
-            self.node.create_subscription(msgs().DiagnosticArray, f"/{name}/status", keep, quality(5))
+            topic = "/world/status" if name == "world" else f"/{name}/robot/status"
+            self.node.create_subscription(msgs().DiagnosticArray, topic, keep, quality(5))
         for name in self.names:
 
             def see(message, name=name):

@@ -139,8 +139,8 @@ def _check_room(config: SwarmConfig, limits: SafetyLimits) -> None:
     if gaps.min() < 0:
         raise ValueError(
             f"limits.room={[list(corner) for corner in limits.room]}: the workspace, {list(planner.workspace_low)} to "
-            f"{list(planner.workspace_high)}, is not inside; give the lower corner first, in the world's "
-            "frame, in metres"
+            f"{list(planner.workspace_high)}, is not inside; give the lower corner first, in metres, in the frame of "
+            "the world, whose scenarios are drawn around x = y = 0"
         )
     if gaps[0, 2] < config.radius:
         raise ValueError(

@@ -19,12 +19,13 @@ name                   type                                content
 ====================== =================================== ==================================================
 ``/NAME/goal_pose``    geometry_msgs/PoseStamped           where to fly, in the frame "map", and with
                                                            ``planner.max_yaw_rate`` which heading to turn to
-``/NAME/status``       diagnostic_msgs/DiagnosticArray     once a second: what the robot does, why, and counts
+``/NAME/robot/status`` diagnostic_msgs/DiagnosticArray     once a second: what the robot does, why, and counts
 ``/NAME/robot/land``   std_srvs/Trigger (a service)        begins to land, as ``deactivate`` does
 ====================== =================================== ==================================================
 
 A wish to land must not get lost and wants an answer, so it is a service, as with Crazyswarm2 and Aerostack2. Its name
-is below the node's, since Crazyswarm2 has a service ``/NAME/land`` of another type.
+is below the node's, as that of the status is, since Crazyswarm2 has a service ``/NAME/land`` and a topic
+``/NAME/status`` of other types.
 """
 
 from __future__ import annotations
@@ -324,7 +325,9 @@ class RobotNode:
         link = RosLink(self.node, self._mailbox, index, names)
         period = round(config.planner.dt * 1e6)
         vehicle = make_vehicle((self.node, self._mailbox, link, names), values, period)
-        self._status = self.node.create_publisher(msgs().DiagnosticArray, f"/{name}/status", quality(5, reliable=True))
+        self._status = self.node.create_publisher(
+            msgs().DiagnosticArray, f"/{name}/robot/status", quality(5, reliable=True)
+        )
         # Goals must arrive; whoever sends one to a robot that does not fly yet is told so by the log
         self._mailbox.subscribe(msgs().PoseStamped, f"/{name}/goal_pose", 10, self._take_goal)
         self.node.create_service(Trigger, "~/land", self._take_wish)

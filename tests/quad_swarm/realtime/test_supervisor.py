@@ -250,9 +250,7 @@ def test_a_robot_that_leaves_the_workspace_stops_before_the_walls():
         make(1.0)
     with pytest.raises(ValueError, match=r"needs 1\.85 m to stop.*, or planner\.max_speed below 2$"):
         make(0.3, config=make_config(slow, {"planner": {"max_speed": 2.0}}))
-    with pytest.raises(
-        ValueError, match=r"needs 1\.75 m to stop: give planner.workspace_low=\S+ \S+ \S+ and \S+ \S+ \S+$"
-    ):
+    with pytest.raises(ValueError, match=r"needs 1\.75 m to stop: (?!.*max_speed)"):
         make(1.0)  # 1.05 m are less than fence and radius: no speed is slow enough
     with pytest.raises(ValueError, match=r"room"):
         SafetyLimits(room=((0, 0, 0), (1, 1, float("inf"))))

@@ -152,7 +152,7 @@ def test_a_robot_begins_to_fly_in_the_air_if_it_sees_everybody(make, transitions
     robot = make(**GOOD)
     node, before = robot.node, topics(robot)
     assert node.trigger_configure() == transitions.SUCCESS
-    assert {"/robot_0/goal_pose", "/robot_0/status", "/robot_0/cmd", "/robot_1/odom"} <= topics(robot)
+    assert {"/robot_0/goal_pose", "/robot_0/robot/status", "/robot_0/cmd", "/robot_1/odom"} <= topics(robot)
 
     def refused():
         result, error = node.trigger_activate(), capfd.readouterr().err
@@ -303,7 +303,7 @@ with Operator(["robot_0", "robot_1"]) as operator:
     operator.wait(lambda: "robot_0" in operator.status["world"]["on the ground"])
     assert operator.position["robot_0"][2] < 0.1
     assert operator.change("robot_0", "cleanup")
-    operator.wait(lambda: operator.node.count_publishers("/robot_0/status") == 0)
+    operator.wait(lambda: operator.node.count_publishers("/robot_0/robot/status") == 0)
     assert operator.change("robot_0", "configure")
     assert not operator.change("robot_0", "activate"), "it lies on the ground"
     process = operator.processes.pop("robot_1")
