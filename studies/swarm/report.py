@@ -662,7 +662,12 @@ def front_table(second: Rows, third: Rows, page: str) -> str:
         ("constant velocity (`flight-v2`)", "nobody", second, "none"),
         (orca, "nobody", second, ORCA),
         ("network (`flight-v3`)", "nobody", third, "none"),
-        ("network (`flight-v3`)", f"rule `{THIRD_POLICIES['rule']}`", third, THIRD_POLICIES["rule"]),
+        (
+            "network (`flight-v3`)",
+            f"rule: tell whom it would surprise nearby (`{THIRD_POLICIES['rule']}`)",
+            third,
+            THIRD_POLICIES["rule"],
+        ),
         ("network (`flight-v3`)", "**learned**", third, THIRD_POLICIES["model"]),
         ("network (`flight-v3`)", "everybody", third, FULL),
     ):
