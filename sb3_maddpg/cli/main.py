@@ -33,7 +33,8 @@ commands:
 
 `COMMAND --help` shows examples and the frequent options of a command, `COMMAND --help-all` all of them. Options and
 recipes are those of rl_zoo3, but --algo defaults to maddpg and --conf-file to the packaged recipe; --env-kwargs are
-merged over those of the recipe; -i MODEL.zip continues a training where it ended; and no text is evaluated.
+merged over those of the recipe; -i MODEL.zip continues a training where it ended; and values are plain literals, which
+run no code.
 --env PACKAGE/MODULE is a PettingZoo environment (MODULE for a file in the current folder). Its --env-kwargs are the
 arguments of its parallel_env, `state:true` for critics that read the global state, and SuperSuit `wrappers`. With an
 algorithm of Stable-Baselines3, such as --algo ppo, all agents share one policy.
