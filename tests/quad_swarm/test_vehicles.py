@@ -1,12 +1,14 @@
 """Vehicles by name and from files."""
 
 import os
+import warnings
 
 import pytest
 import yaml
 
 from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorParams
 from quad_swarm.vehicles import VEHICLES, load_vehicle
+from quad_swarm.world.doubts import DoubtfulWorld
 from quad_swarm.world.presets import make_config
 
 
@@ -101,6 +103,19 @@ def test_paths_may_be_objects_and_numbers_are_decimal(tmp_path):
     path.write_text(f"# mine\nparameters: {{drag_x: 010, drag_y: 1e-1{rest}}}\nresiduals: {{roll_rms: 0.1}}\n")
     for make in (lambda: make_config("paper", quadrotor=path), lambda: make_config("paper", {"quadrotor": path})):
         assert make().quadrotor == QuadrotorParams(9.81, 10.0, 0.1, *6 * [1.0])
+
+
+def test_a_file_has_no_downwash_and_a_world_that_does_not_say_it_is_doubted(tmp_path):
+    path = tmp_path / "vehicle.yml"
+    given = {name: getattr(QuadrotorParams(), name) for name in VEHICLE_PARAMETERS}
+    path.write_text(yaml.safe_dump({"parameters": given}))
+    with pytest.warns(DoubtfulWorld, match=r"vehicle\.yml': a vehicle file has no downwash.* set planner\.downwash"):
+        make_config("paper", quadrotor=str(path))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for downwash in (1, 3):
+            make_config("paper", quadrotor=str(path), planner={"downwash": downwash})
+        make_config("paper", quadrotor="hummingbird")
 
 
 def test_a_file_that_lacks_a_parameter_is_not_completed_with_another_vehicle(tmp_path):

@@ -22,7 +22,7 @@ from quad_swarm.planner.problem import check_vehicle, make_problem, problem_clas
 from quad_swarm.plants.base import MODEL, Plant, make_plant, parse_plant
 from quad_swarm.quadrotor import VELOCITY, MixedModel, QuadrotorParams, VehicleModel
 from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, angles, checked, points, replaced, vectors
-from quad_swarm.vehicles import DOWNWASH, load_vehicle
+from quad_swarm.vehicles import DOWNWASH, VEHICLES, load_vehicle
 from quad_swarm.world.anticipation import load_predictor
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
 from quad_swarm.world.doubts import (
@@ -803,7 +803,15 @@ def _with_downwash(base: SwarmConfig, changes: dict[str, Any]) -> dict[str, Any]
     kinds = [one for one in several if isinstance(one, Mapping)] if isinstance(several, (list, tuple)) else []
     names = [one.get("quadrotor") for one in (changes, *kinds)]
     known = [DOWNWASH[name] for name in names if isinstance(name, str) and name in DOWNWASH]
-    if not known or not isinstance(planner, Mapping) or "downwash" in planner or base.planner.downwash != 1:
+    if not isinstance(planner, Mapping) or "downwash" in planner or base.planner.downwash != 1:
+        return changes
+    if not known:
+        files = [name for name in names if isinstance(name, (str, os.PathLike)) and name not in VEHICLES]
+        if files:
+            warn(
+                f"quadrotor={shown(files[0])}: a vehicle file has no downwash, so robots keep out of spheres: set "
+                "planner.downwash, to 3 for Crazyflies, or to 1"
+            )
         return changes
     return {**changes, "planner": {**planner, "downwash": max(known)}}
 
