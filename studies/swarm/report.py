@@ -664,7 +664,7 @@ def front_table(second: Rows, third: Rows, page: str) -> str:
         ("network (`flight-v3`)", "nobody", third, "none"),
         (
             "network (`flight-v3`)",
-            f"rule: tell whom it would surprise nearby (`{THIRD_POLICIES['rule']}`)",
+            f"rule: who passes near tells its plan if it is not expected (`{THIRD_POLICIES['rule']}`)",
             third,
             THIRD_POLICIES["rule"],
         ),

@@ -329,7 +329,11 @@ def test_tables_of_version_3_say_who_sends_and_what_it_costs():
         ["nobody", "1,800 of 2,000 [88.61, 91.24] % 0.00% sent", ""],
         ["nobody", "4 of 2,000 [0.08, 0.51] % 0.00% sent, +10%", ""],
         ["nobody", "2 of 2,000 [0.03, 0.36] % 0.00% sent, -2%", "5 of 2,000 [0.11, 0.58] % 0.00% sent"],
-        [f"rule: tell whom it would surprise nearby (`{rule}`)", "1 of 2,000 [0.01, 0.28] % 0.25% sent, +0%", ""],
+        [
+            f"rule: who passes near tells its plan if it is not expected (`{rule}`)",
+            "1 of 2,000 [0.01, 0.28] % 0.25% sent, +0%",
+            "",
+        ],
         ["**learned**", "0 of 2,000 [0.00, 0.19] % 0.03% sent, +2%", ""],
         ["everybody", "0 of 2,000 [0.00, 0.19] % 100.00% sent, 3.5 s", ""],
     ]
