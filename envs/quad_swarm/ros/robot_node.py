@@ -95,7 +95,7 @@ PARAMETERS: dict[str, Any] = {
     "origins": [],
     "most_thrust": 0.0,
     "gains": [],
-    "heading": 0.0,
+    "heading": [],
 }
 # Vehicles that are not simulated
 REAL = ("crazyswarm", "crazyswarm_legacy", "px4", "aerostack")
@@ -113,9 +113,10 @@ def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[st
     :raises ImportError: if the package of its messages is not there
     """
     places = numbers("origins", values["origins"], 3)
-    thrust, heading = (float(numbers(name, [values[name]], 1)[0, 0]) for name in ("most_thrust", "heading"))
+    thrust = float(numbers("most_thrust", [values["most_thrust"]], 1)[0, 0])
+    heading = float(numbers("heading", [values["heading"]], 1)[0, 0]) if np.size(values["heading"]) else None
     gains = AttitudeGains(**read_assignments("gains", texts("gains", values["gains"])))
-    controller = AttitudeController(gains, heading)
+    controller = AttitudeController(gains)
     makers: dict[str, Callable[[], TeamVehicle]] = {
         "odometry": lambda: OdometryVehicle(*robot, topic=values["odom_topic"], twist=values["twist"]),
         "crazyswarm": lambda: CrazyswarmVehicle(*robot, period=period, controller=controller),
@@ -126,6 +127,7 @@ def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[st
     if values["vehicle"] not in makers:
         raise unknown_name("vehicle", values["vehicle"], makers)
     vehicle = makers[values["vehicle"]]()
+    vehicle.heading = heading
     if values["poses"]:
         vehicle.watch_poses(values["poses"])
     return vehicle

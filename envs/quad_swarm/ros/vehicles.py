@@ -47,6 +47,7 @@ class TeamVehicle:
     """Perceives all robots by a topic of each. Its subclasses command.
 
     :ivar controller: attitude and thrust for set-points
+    :ivar heading: heading to hold in flights (rad), None for the one that the robot has when they begin
 
     :param node: the robot's node
     :param mailbox: receives for it
@@ -71,6 +72,7 @@ class TeamVehicle:
     ):
         self._node, self._link, self._name = node, link, names[link.index]
         self._mailbox, self._names = mailbox, list(names)
+        self.heading: float | None = None
         self._captures: Callable[[], Any] | None = None
         self._captured: dict[str, tuple[int, np.ndarray]] = {}
         self.controller = controller or AttitudeController()
@@ -103,8 +105,9 @@ class TeamVehicle:
         return sensed_together(stamp, own, np.array(stamps), seen[:, POSITION], seen[:, VELOCITY])
 
     def engage(self) -> None:
-        """Prepare for set-points: a flight begins."""
-        self.controller.reset()
+        """Prepare for set-points: a flight begins. The controller holds `heading` from now on."""
+        own = self._seen().get(self._link.index)
+        self.controller.reset(self.heading if self.heading is not None or own is None else float(own[1][8]))
 
     def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
         """See `quad_swarm.realtime.Vehicle`."""
@@ -224,6 +227,11 @@ class CrazyswarmVehicle(OdometryVehicle):
         self._period, self._lead = period, period // 2 if lead is None else lead
         self._held: np.ndarray | None = None
         super().__init__(*robot, twist="world", controller=controller)
+
+    def engage(self) -> None:
+        """See `TeamVehicle`. No place is held yet."""
+        super().engage()
+        self._held = None
 
     def _make_publishers(self) -> None:
         self._full_state = _class("crazyflie_interfaces", "FullState")

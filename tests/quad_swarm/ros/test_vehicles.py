@@ -203,6 +203,20 @@ def test_states_grow_old_of_robots_that_motion_capture_does_not_see(packages):
     assert link.traffic.refused == 6
 
 
+@pytest.mark.parametrize(("heading", "held"), [(None, 0.7), (-0.4, -0.4)])
+def test_a_flight_holds_the_heading_that_it_began_with_unless_one_is_given(packages, heading, held):
+    vehicle, node, link = make(vehicles.CrazyswarmVehicle, period=PERIOD)
+    vehicle.heading = heading
+    for yaw in (0.7, 0.2):  # it is turned by hand while nobody flies it
+        seen(node, link, STATES - [0, 0, 0, 0, 0, 0, 0, 0, 0.7 - yaw], world=True)
+        vehicle.engage()
+        vehicle.command(np.zeros(4), None)
+        q = node.published["/robot_0/cmd_full_state"][-1].pose.orientation
+        expected = yaw if heading is None else held
+        assert from_quaternion(np.array([q.x, q.y, q.z, q.w]))[2] == pytest.approx(expected)
+        link.time += 50_000
+
+
 def test_commands_that_nobody_receives_are_named():
     vehicle, node, _ = make(vehicles.OdometryVehicle)
     assert vehicle.unheard() == ["/robot_0/cmd"]
