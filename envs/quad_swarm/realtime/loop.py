@@ -277,7 +277,8 @@ class Loop:
                 self._failing_since = now if self._failing_since is None else self._failing_since
                 setpoint = HOVERING
             if mode is Mode.LAND:  # the planner brakes and evades, but may not want to sink
-                setpoint, plan = np.array([*setpoint[:2], self.supervisor.limits.landing, setpoint[3]]), None
+                setpoint = np.array([*setpoint[:2], self.supervisor.limits.landing, setpoint[3]])
+                plan = None if plan is None else self._sinking(plan)
         elif mode is Mode.OFF:
             self._off += 1
             self._call("vehicle", self.vehicle.disarm)
@@ -290,6 +291,13 @@ class Loop:
         statistics.durations["compute"].add(self._computed + done - now)
         statistics.durations["total"].add(done - self._tick)
         statistics.counts["late commands"] += done - self._tick > self.late * robot.period
+
+    def _sinking(self, plan: Plan) -> Plan:
+        """Return a plan that moves sideways as another one, and sinks as a landing does."""
+        positions = plan.positions.copy()
+        times = self.robot.period / _US * np.arange(len(positions))
+        positions[:, 2] = positions[0, 2] + self.supervisor.limits.landing * times
+        return plan._replace(positions=positions)
 
     def on_request(self, sender: int) -> None:
         """See `Handler`. Robots that do not plan have nothing to tell: they move as they are seen to."""

@@ -296,11 +296,16 @@ def test_a_landing_brakes_and_sinks_whatever_the_planner_wants():
     assert periods(loop, 1) == [Mode.LAND]
     _at, setpoint, plan = vehicle.commands[-1]
     assert setpoint[1] < -0.1, "nose up, against the motion"
-    assert (setpoint[2], plan) == (-0.5, None)
+    assert setpoint[2] == -0.5
+    newest = loop.robot.newest
+    assert np.array_equal(plan.positions[:, :2], newest.positions[:, :2]), "who follows plans brakes and evades, too"
+    assert np.allclose(np.diff(plan.positions[:, 2]), -0.5 * PERIOD * 1e-6)
+    assert plan.positions[0, 2] == newest.positions[0, 2]
     assert loop.robot.newest.positions[-1, 2] < 1.4, "others are told that it sinks"
     loop.robot.plan = lambda: np.full(4, np.nan)
     periods(loop, 1)
     assert vehicle.commands[-1][1].tolist() == [0, 0, -0.5, 0]
+    assert vehicle.commands[-1][2] is None
 
 
 def test_after_landing_the_motors_stop():
