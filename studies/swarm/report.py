@@ -659,22 +659,22 @@ def front_table(second: Rows, third: Rows, page: str) -> str:
     orca = f"[ORCA]({page}#without-messages-orca-and-voronoi-cells) (`flight-v2`)"
     lines = []
     for predicted, who, rows, policy in (
-        ("constant velocity (`flight-v2`)", "nobody", second, "none"),
+        ("planning at constant velocities (`flight-v2`)", "nobody", second, "none"),
         (orca, "nobody", second, ORCA),
-        ("network (`flight-v3`)", "nobody", third, "none"),
+        ("network, keeping right (`flight-v3`)", "nobody", third, "none"),
         (
-            "network (`flight-v3`)",
+            "network, keeping right (`flight-v3`)",
             f"rule: who passes near tells its plan if it is not expected (`{THIRD_POLICIES['rule']}`)",
             third,
             THIRD_POLICIES["rule"],
         ),
-        ("network (`flight-v3`)", "**learned**", third, THIRD_POLICIES["model"]),
-        ("network (`flight-v3`)", "everybody", third, FULL),
+        ("network, keeping right (`flight-v3`)", "**learned**", third, THIRD_POLICIES["model"]),
+        ("network, keeping right (`flight-v3`)", "everybody", third, FULL),
     ):
         found = {n: everybody[n] if policy == FULL else flown(rows, policy, n) for n in sizes}
         if any(found.values()):
             lines.append([predicted, who, *(cell(found[n], everybody[n]) for n in sizes)])
-    return table(["others are predicted by", "who sends", "eight robots", "sixteen robots"], lines)
+    return table(["how they avoid each other", "who sends", "eight robots", "sixteen robots"], lines)
 
 
 def anticipation_table(rows: Rows) -> str:
