@@ -130,10 +130,14 @@ class TeamVehicle:
         return self._states
 
     def _take_poses(self) -> None:
-        message = None if self._captures is None else self._captures()
-        for one in () if message is None else message.poses:
-            place = one.pose.position
-            self._captured[one.name] = self._link.now(), np.array([place.x, place.y, place.z])
+        try:
+            message = None if self._captures is None else self._captures()
+            for one in () if message is None else message.poses:
+                if one.name in self._names:
+                    place = one.pose.position
+                    self._captured[one.name] = self._link.now(), np.array([place.x, place.y, place.z])
+        except Exception:  # whatever the middleware raises
+            self._link.traffic.refused += 1
 
     def _see(self, number: int, stamp: int, state: np.ndarray) -> None:
         """Keep the newest state of a robot, with the time on this robot's clock."""

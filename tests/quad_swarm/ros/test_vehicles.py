@@ -201,6 +201,17 @@ def test_states_grow_old_of_robots_that_motion_capture_does_not_see(packages):
     assert step((own[0], own[1] + [0.2, 0, 0]), other) == 0
     assert step((own[0], [np.nan] * 3), other) == 50_000
     assert link.traffic.refused == 6
+    assert step(own, other, ("a drone of somebody else", [0, 0, 0])) == 0
+    assert vehicle._captured.keys() == set(NAMES)
+
+    def breaks():
+        raise RuntimeError("no memory")
+
+    vehicle._captures = breaks
+    link.time += 50_000
+    seen(node, link, STATES, world=True)
+    assert vehicle.sense().stamp == link.now(), "seen in the last tenth of a second"
+    assert link.traffic.refused == 7
 
 
 @pytest.mark.parametrize(("heading", "held"), [(None, 0.7), (-0.4, -0.4)])
