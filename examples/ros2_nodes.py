@@ -38,7 +38,7 @@ class Operator:
                 self.status[name] = {"message": one.message, **{pair.key: pair.value for pair in one.values}}
 
             topic = "/world/status" if name == "world" else f"/{name}/robot/status"
-            self.node.create_subscription(msgs().DiagnosticArray, topic, keep, quality(5))
+            self.node.create_subscription(msgs().DiagnosticArray, topic, keep, quality(5, reliable=True))
         for name in self.names:
 
             def see(message, name=name):
@@ -93,6 +93,10 @@ class Operator:
         from lifecycle_msgs.srv import GetState
 
         return self.call(GetState, f"/{name}/robot/get_state").current_state.label
+
+    def told(self, name, key):
+        """Return what the last status of a robot or the world says, or None if there has been none yet."""
+        return self.status.get(name, {}).get(key)
 
     def trigger(self, service):
         """Call a service such as "/robot_0/robot/land", and return whether it succeeded."""
@@ -154,8 +158,8 @@ def swap(operator, policy, **parameters):
     arrived = errors()
     for name in names:
         operator.change(name, "deactivate")
-    operator.wait(lambda: all(operator.status.get(name, {}).get("mode") == "idle" for name in names))
-    operator.wait(lambda: operator.status["world"]["on the ground"].split() == names)
+    operator.wait(lambda: all(operator.told(name, "mode") == "idle" for name in names))
+    operator.wait(lambda: operator.told("world", "on the ground") == " ".join(names))
     return arrived
 
 

@@ -296,11 +296,11 @@ with Operator(["robot_0", "robot_1"]) as operator:
     goal = start + [0, 0, 0.5]
     operator.send("robot_0", goal)
     operator.wait(lambda: np.linalg.norm(operator.position["robot_0"] - goal) < 0.2)
-    operator.wait(lambda: operator.status.get("robot_0", {}).get("mode") == "fly")
+    operator.wait(lambda: operator.told("robot_0", "mode") == "fly")
     assert {"why", "missed", "late commands", "plans sent", "bytes"} <= operator.status["robot_0"].keys()
     assert operator.change("robot_0", "deactivate")
-    operator.wait(lambda: operator.status["robot_0"]["mode"] == "idle")
-    operator.wait(lambda: "robot_0" in operator.status["world"]["on the ground"])
+    operator.wait(lambda: operator.told("robot_0", "mode") == "idle")
+    operator.wait(lambda: "robot_0" in (operator.told("world", "on the ground") or ""))
     assert operator.position["robot_0"][2] < 0.1
     assert operator.change("robot_0", "cleanup")
     operator.wait(lambda: operator.node.count_publishers("/robot_0/robot/status") == 0)
@@ -310,7 +310,7 @@ with Operator(["robot_0", "robot_1"]) as operator:
     process.terminate()
     operator.wait(lambda: process.poll() is not None)
     assert process.returncode == 0
-    operator.wait(lambda: operator.status["world"]["on the ground"] == "robot_0 robot_1")
+    operator.wait(lambda: operator.told("world", "on the ground") == "robot_0 robot_1")
 """
 )
 SWAP = (
@@ -320,7 +320,7 @@ with Operator([f"robot_{k}" for k in range(4)]) as operator:
     operator.start_world(scenario="symmetric_swap")
     errors = swap(operator, "full", limits=LIMITS)
     assert max(errors) < 0.3, errors
-    assert operator.status["world"]["collisions"] == "", operator.status
+    assert operator.told("world", "collisions") == "", operator.status
 """
 )
 
@@ -405,14 +405,14 @@ with Operator(["robot_0", "robot_1"]) as operator:
     )
     operator.wait(there)
     assert operator.trigger("/robot_0/robot/land")
-    operator.wait(lambda: operator.status["robot_0"]["mode"] == "idle")
-    operator.wait(lambda: operator.status["world"]["on the ground"] == "robot_0")
+    operator.wait(lambda: operator.told("robot_0", "mode") == "idle")
+    operator.wait(lambda: operator.told("world", "on the ground") == "robot_0")
     operator.wait(lambda: operator.state("robot_0") == "inactive")
     assert not operator.trigger("/robot_0/robot/land"), "it does not fly"
     assert operator.trigger("/world/reset")
     operator.wait(lambda: operator.change("robot_0", "activate"))
     operator.wait(there)
-    assert operator.status["world"]["collisions"] == ""
+    assert operator.told("world", "collisions") == ""
 """
 )
 
