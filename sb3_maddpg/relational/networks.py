@@ -9,13 +9,13 @@ from typing import cast
 
 import torch as th
 from torch import nn
-from torch.nn import functional as F
 
 from sb3_maddpg.common.actions import TeamActions
 from sb3_maddpg.common.heads import PairHeads, ValueHeads
 from sb3_maddpg.common.layout import NeighbourViews
 from sb3_maddpg.common.policies import Actor, Critic
 from sb3_maddpg.errors import InvalidArgumentError
+from sb3_maddpg.relational.operations import Linear, largest, linear
 
 
 class PairNet(nn.Module):
@@ -23,9 +23,6 @@ class PairNet(nn.Module):
     Network of every pair (agent, neighbour) that also depends on the agent's whole neighbourhood. A first layer encodes
     each view. The encodings are pooled (mean and maximum, as in Deep Sets, Zaheer et al. 2017). A second network reads
     the encoding, the pool and additional inputs.
-
-    In-place operations avoid tensors that are views, because autograd would copy their gradients. Linear layers with a
-    bias return views for inputs with more than two axes.
 
     :param in_features: length of a view
     :param extras: lengths of the additional inputs, see ``extra``
@@ -50,12 +47,12 @@ class PairNet(nn.Module):
         width, *later = net_arch
         self.activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
         self.goes_below_zero = bool((self.activation(th.linspace(-9.0, 9.0, 181)) < 0).any())
-        self.encoder = nn.Linear(in_features, width)
+        self.encoder = Linear(in_features, width)
         widths = [*later, out_features]
-        self.of_pair = nn.Linear(width, widths[0])
-        self.of_pool = nn.Linear(2 * width, widths[0], bias=False)
-        self.of_extras = nn.ModuleList(nn.Linear(length, widths[0], bias=False) for length in extras)
-        self.later = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
+        self.of_pair = Linear(width, widths[0])
+        self.of_pool = Linear(2 * width, widths[0], bias=False)
+        self.of_extras = nn.ModuleList(Linear(length, widths[0], bias=False) for length in extras)
+        self.later = nn.ModuleList(Linear(a, b) for a, b in pairwise(widths))
 
     def encode(self, views: th.Tensor, present: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -66,19 +63,19 @@ class PairNet(nn.Module):
         :return: the contribution of encoding and pool to the second network's first layer, before its activation,
             (..., n_neighbours, width), and the pool, (..., 2 * the encoding's width)
         """
-        encoded = self.activation(self.encoder(views.flatten(end_dim=-2))).unflatten(0, views.shape[:-1])
+        encoded = self.activation(self.encoder(views))
         if present is None:
             mean = encoded.mean(dim=-2)
         else:
             encoded = encoded * present
             mean = encoded.sum(dim=-2) / present.sum(dim=-2).clamp(min=1.0)
         if present is not None and self.goes_below_zero:  # the zeros of absent neighbours could be the maximum
-            largest = encoded.masked_fill(present == 0, -th.inf).amax(dim=-2).masked_fill(~present.any(dim=-2), 0.0)
+            most = encoded.masked_fill(present == 0, -th.inf).amax(dim=-2).masked_fill(~present.any(dim=-2), 0.0)
         else:
-            largest = encoded.amax(dim=-2)
-        pool = th.cat([mean, largest], dim=-1)
+            most = largest(encoded)
+        pool = th.cat([mean, most], dim=-1)
         of_pool = self.of_pool(pool).add_(self.of_pair.bias)
-        return F.linear(encoded, self.of_pair.weight).add_(of_pool.unsqueeze(-2)), pool
+        return linear(encoded, self.of_pair.weight).add_(of_pool.unsqueeze(-2)), pool
 
     def extra(self, index: int, x: th.Tensor) -> th.Tensor:
         """
@@ -93,10 +90,9 @@ class PairNet(nn.Module):
         :param hidden: outputs of the second network's first layer, before its activation, (..., width)
         :return: the outputs, (..., out_features)
         """
-        shape = hidden.shape[:-1]
         for layer in self.later:
-            hidden = layer(self.activation(hidden).flatten(end_dim=-2))
-        return hidden.reshape(*shape, hidden.shape[-1])
+            hidden = layer(self.activation(hidden))
+        return hidden
 
 
 _NEVER = -120.0  # a logit whose probability is 0 in single precision
@@ -239,8 +235,9 @@ class PairCritic(Critic):
         net = self.modules_of_nets[0]
         hidden, present = self._hidden(net, obs, self._pairs(obs, actions)[1])
         own = own.unflatten(1, hidden.shape[1:3]) if self.on_neighbours else own.unsqueeze(2)
-        mine = net.extra(0, own)
-        values = net.head(hidden.unsqueeze(3) + mine).squeeze(-1) * present
+        # One after another, since the memory takes longer than the arithmetic
+        each = [net.head(hidden + net.extra(0, alternative)) for alternative in own.unbind(3)]
+        values = th.cat(each, dim=-1) * present
         return values.flatten(1, 2) if self.on_neighbours else values.sum(dim=2)
 
     def clip_grad_norm_(self, max_norm: float) -> None:
