@@ -31,10 +31,11 @@ robots: the packaged model of version 2, nobody, everybody, and a rule that tell
 ``third_hummingbird``, ``third_crazyflie`` and ``third_many``, these in the disturbances of `flight-hard`, in the
 foreign simulators, and with 24 and 32 robots; set 724 ``third_seeds_SIZE``, all scenarios in `flight-v3` with the
 recipe's other training seeds; set 726 ``third_random_SIZE``, robots that ask at random about as often as the model
-sends. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before robots of version 3 kept right
-of predicted others; set 721 never flew. All parts before set 706 fly with equal penalties, those before set 709 without
-the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written
-after each row, so that a run that is ended keeps what it has.
+sends; set 727 ``third_more_SIZE``, the packaged model as in set 722, for 12,000 flights of eight robots and 4,000 of
+other numbers in all. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before robots of version
+3 kept right of predicted others; set 721 never flew. All parts before set 706 fly with equal penalties, those before
+set 709 without the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of
+`summarise`; written after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -60,13 +61,14 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE = (
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE, MOST = (
     713,
     *range(715, 720),
     722,
     723,
     724,
     726,
+    727,
 )
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
@@ -222,6 +224,13 @@ PARTS |= {
 PARTS |= {
     f"third_random_{size}": Part(("random:0.003",), EVERYWHERE, (SIZES[size],), 2000, CHANCE, preset="flight-v3")
     for size in ("twelve", "sixteen")
+}
+# What set 722 lacks of 12,000 flights of eight robots and 4,000 of other numbers
+PARTS |= {
+    f"third_more_{size}": Part(
+        (THIRD_POLICIES["model"],), EVERYWHERE, (n,), 10000 if n == 8 else 2000, MOST, preset="flight-v3"
+    )
+    for size, n in SIZES.items()
 }
 _THREE = tuple(THIRD_POLICIES[what] for what in ("full", "none", "model"))
 PARTS |= {
