@@ -127,7 +127,7 @@ class Vehicles:
         self.state[:, POSITION] = starts
         self._plant.place(0, self._state[0])
         if self.config.is_random:
-            self._realisation.reset(0, noise_seed)
+            self._realisation.reset(0, noise_seed, self._state[0])
         self._u = np.zeros((1, n, N_INPUTS))
         self._commanded = np.full(n, now)
         self.flying, self.held = np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -174,12 +174,11 @@ class Vehicles:
         still = ~self.flying | self.held
         stays = self.state[still].copy()
         self._state = self._plant.step(self._state, u[None], realisation.air, realisation.factors)
+        self.state[still] = stays
         self._steps += 1
         if self._steps % self.config.substeps == 0 and self.config.is_random:
-            kicks = realisation.advance()
-            if kicks is not None:
-                self._state = self._state + kicks
-        self.state[still] = stays
+            self._state = realisation.advance(self._state)
+            self.state[still] = stays
         self.now += self.step_us
         self._meet(before)
         self.flying &= self.state[:, 2] > 0.0
@@ -242,6 +241,7 @@ class Vehicles:
 
     def _sense(self) -> None:
         estimate = self._realisation.estimate(self._state)
-        seen = estimate.take(self._others, axis=1)
+        since = self._steps % self.config.substeps * self.step_us / _US
+        seen = self._realisation.shown(estimate, since).take(self._others, axis=1)
         pos, vel = self._realisation.observe(seen[..., POSITION], seen[..., VELOCITY])
         self._perceived = estimate[0], pos[0], vel[0]

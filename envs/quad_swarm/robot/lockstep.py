@@ -61,7 +61,7 @@ class LockstepWorld:
         self.state[0], self._u[:], self.now = states, 0.0, 0
         self.plant.place(0, self.state[0])
         if self.config.is_random:
-            self.realisation.reset(0, noise_seed)
+            self.realisation.reset(0, noise_seed, self.state[0])
         radio, start = self.config.radio, self.realisation.start
         late = np.zeros(len(self.robots)) if start is None else start[0] / self.config.substeps
         targets = Targets.of(goals, velocities, waypoints, len(self.robots))
@@ -99,7 +99,7 @@ class LockstepWorld:
         """Return estimates of the robots' own states, (n, 9), and positions and velocities of their others as they
         observe them, (n, n - 1, 3) each."""
         estimate = self.realisation.estimate(self.state)
-        seen = estimate.take(self._others, axis=1)
+        seen = self.realisation.shown(estimate).take(self._others, axis=1)
         pos, vel = self.realisation.observe(seen[..., POSITION], seen[..., VELOCITY])
         return estimate[0], pos[0], vel[0]
 
@@ -137,6 +137,4 @@ class LockstepWorld:
             self._u = planned if late is None else np.where((late <= k)[..., None], planned, before)
             self.state = self.plant.step(self.state, self._u, realisation.air, realisation.factors)
         if self.config.is_random:
-            kicks = realisation.advance()
-            if kicks is not None:
-                self.state = self.state + kicks
+            self.state = realisation.advance(self.state)

@@ -52,7 +52,9 @@ class SensingError:
     """Standard deviations of the errors of estimated states, which are first-order Gauss-Markov processes.
 
     The others observe a robot at its own estimate, as if one motion capture system served all robots, plus an
-    additional error for each observer.
+    additional error for each observer. What they observe may come late, and a robot may be lost from sight, as when
+    markers are covered: meanwhile, it moves on at its last velocity in the eyes of all others. It does not know that,
+    and keeps its own estimate.
 
     :param pos: error of each component of a robot's position (m)
     :param vel: error of each component of its velocity (m/s)
@@ -60,7 +62,12 @@ class SensingError:
     :param others_pos: additional error of each component of another robot's position, different for each observer (m)
     :param others_vel: additional error of each component of another robot's velocity, different for each observer (m/s)
     :param correlation_time: correlation time of the errors (s); 0 for white noise
-    :raises ValueError: if a value is negative, not finite, or above 1000 (pi for the attitude)
+    :param others_delay: age of what is observed of others (steps); observers know it, and move them on at their
+        velocities
+    :param gaps: fraction of the time in which a robot is lost, independently of other robots; at the start, none is
+    :param gap_length: mean length of a gap (steps)
+    :raises ValueError: if a value is negative, not finite, or above 1000 (pi for the attitude, below 1 for ``gaps``),
+        or ``gap_length`` is less than a step
     """
 
     pos: Disturbance = 0.0
@@ -69,6 +76,9 @@ class SensingError:
     others_pos: Disturbance = 0.0
     others_vel: Disturbance = 0.0
     correlation_time: NonNegativeFloat = 0.2
+    others_delay: Annotated[int, Field(ge=0, le=1000)] = 0
+    gaps: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    gap_length: Annotated[float, Field(ge=1)] = 10.0
 
     @functools.cached_property
     def own(self) -> bool:
@@ -80,8 +90,13 @@ class SensingError:
         """Whether observers have additional errors about others."""
         return any((self.others_pos, self.others_vel))
 
+    @functools.cached_property
+    def tracks(self) -> bool:
+        """Whether what others observe of a robot may be late or lost."""
+        return bool(self.others_delay or self.gaps)
+
     def __bool__(self) -> bool:
-        return self.own or self.others
+        return self.own or self.others or self.tracks
 
 
 @checked

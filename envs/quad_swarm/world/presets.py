@@ -123,6 +123,7 @@ class SwarmConfig:
                 "or left out to follow the radius"
             )
         self._check_predictor()
+        self._check_sensing()
         if self.vehicles:
             self._check_vehicles()
             return
@@ -267,6 +268,13 @@ class SwarmConfig:
                     f"{name}={reach}: {does} at least up to the distance that robots keep, "
                     f"planner.separation={planner.separation}"
                 )
+
+    def _check_sensing(self) -> None:
+        if self.is_limited and self.sensing.tracks:
+            raise ValueError(
+                f"sensing.others_delay={self.sensing.others_delay} and sensing.gaps={self.sensing.gaps:g}: they are "
+                "for robots that perceive all others; set them to 0, or `neighbourhood` to its defaults"
+            )
 
     def _check_vehicle(self) -> None:
         planner, kind = self.planner, problem_class(self.planner)

@@ -29,7 +29,8 @@ class Realisation:
     :ivar start: sub-step at which each robot's new input takes effect, (E, n); None if it is always the first
     """
 
-    _ARRAYS = ("_wind", "_gust", "_own", "_observer", "_factors", "_start", "_down", "_silent_from", "_step")
+    _SIGHT = ("_lost", "_past")
+    _ARRAYS = ("_wind", "_gust", "_own", "_observer", "_factors", "_start", "_down", "_silent_from", "_step", *_SIGHT)
 
     def __init__(self, config: SwarmConfig, n_swarms: int):
         n, dt = config.n_robots, config.planner.dt
@@ -44,6 +45,9 @@ class Realisation:
         self._down = np.zeros((n_swarms, n, config.n_others), dtype=bool)
         self._silent_from = np.full((n_swarms, n), _NEVER)
         self._step = np.zeros(n_swarms, dtype=np.int64)
+        self._lost = np.zeros((n_swarms, n), dtype=bool)
+        # Where the others would observe each robot without a delay, in the last steps, newest first
+        self._past = np.zeros((n_swarms, config.sensing.others_delay + 1, n, 6))
 
         noise, sensing = config.noise, config.sensing
         # Scales of position, velocity and attitude; yaw has no noise
@@ -66,8 +70,11 @@ class Realisation:
     def start(self) -> np.ndarray | None:
         return self._start if self._latest_start else None
 
-    def reset(self, swarm: int, seed: int) -> None:
-        """Draw the constants of an episode of one swarm, and initialise its random processes."""
+    def reset(self, swarm: int, seed: int, states: np.ndarray) -> None:
+        """Draw the constants of an episode of one swarm, and initialise its random processes.
+
+        :param states: states at the start, (n, 9)
+        """
         config, radio = self.config, self.config.radio
         rng = self._rngs[swarm] = np.random.default_rng(seed)
         direction = rng.uniform(0, 2 * np.pi)
@@ -89,6 +96,10 @@ class Realisation:
             self._own[swarm] = self._own_scale * rng.normal(size=self._own.shape[1:])
         if config.sensing.others:
             self._observer[swarm] = self._observer_scale * rng.normal(size=self._observer.shape[1:])
+        self._lost[swarm] = False
+        if config.sensing.tracks:
+            seen, ages = (states + self._own[swarm])[..., :6], np.arange(self._past.shape[1])
+            self._past[swarm] = _moved_on(seen, -config.planner.dt * ages[:, None, None])
 
     def draw_for_new_neighbours(self, slots: np.ndarray) -> None:
         """Draw new observation errors and link states for slots with new robots.
@@ -133,6 +144,8 @@ class Realisation:
             "_factors": (1e-6, 1e6),
         }
         for name in self._ARRAYS:
+            if name in self._SIGHT and not self.config.sensing.tracks and name.lstrip("_") not in state:
+                continue  # of a version that had no such disturbances
             array = like(getattr(self, name), state[name.lstrip("_")], name.lstrip("_"), *limits.get(name, ()))
             setattr(self, name, array)
         self._rngs = [generator_of(one) for one in state["generators"]]
@@ -140,6 +153,18 @@ class Realisation:
     def estimate(self, state: np.ndarray) -> np.ndarray:
         """Return the robots' estimates of their own states, (E, n, 9)."""
         return state + self._own if self.config.sensing.own else state
+
+    def shown(self, state: np.ndarray, since: float = 0.0) -> np.ndarray:
+        """Return the positions and velocities at which others observe the robots, before `observe`.
+
+        :param state: estimates of the robots' own states, (E, n, 9)
+        :param since: time since the last step (s)
+        :return: (E, n, 6), or (E, n, 9) if they are those of the estimates
+        """
+        sensing = self.config.sensing
+        if not sensing.tracks:
+            return state
+        return _moved_on(self._past[:, -1], since + sensing.others_delay * self.config.planner.dt)
 
     def observe(self, pos: np.ndarray, vel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Add the observers' errors to positions and velocities of others, (E, n, n - 1, 3) each."""
@@ -183,9 +208,7 @@ class Realisation:
             requests = requests & (np.stack([rng.random(shape) for rng in self._rngs]) >= radio.loss)
         if radio.bursts:
             chance = np.stack([rng.random(shape) for rng in self._rngs])
-            ends = 1 / radio.burst_length
-            begins = radio.bursts * ends / (1 - radio.bursts)
-            self._down = np.where(self._down, chance >= ends, chance < begins)
+            self._down = _interrupted(self._down, chance, radio.bursts, radio.burst_length)
             requests = requests & ~self._down
         if radio.outage:
             silent = self._silent_from <= self._step[:, None]
@@ -194,14 +217,16 @@ class Realisation:
             lateness = np.stack([rng.integers(0, radio.jitter + 1, shape) for rng in self._rngs])
         return requests, lateness
 
-    def advance(self) -> np.ndarray | None:
+    def advance(self, state: np.ndarray) -> np.ndarray:
         """Advance all random processes by a step.
 
-        :return: noise to add to the states, (E, n, 9), None without process noise
+        :param state: states at its end, (E, n, 9)
+        :return: the states with process noise, (E, n, 9)
         """
         self._step += 1
         noise, sensing = self.config.noise, self.config.sensing
-        kicks = self._kick * self._normal(self._own.shape) if noise else None
+        if noise:
+            state = state + self._kick * self._normal(self._own.shape)
         if noise.gust:
             self._gust = _continued(self._gust, self._gust_keeps, noise.gust, self._normal(self._gust.shape))
         if sensing.own:
@@ -209,10 +234,38 @@ class Realisation:
         if sensing.others:
             drawn = self._normal(self._observer.shape)
             self._observer = _continued(self._observer, self._errors_keep, self._observer_scale, drawn)
-        return kicks
+        if sensing.tracks:
+            self._track(self.estimate(state))
+        return state
+
+    def _track(self, estimate: np.ndarray) -> None:
+        sensing, newest = self.config.sensing, estimate[..., :6]
+        if sensing.gaps:
+            chance = np.stack([rng.random(self._lost.shape[1:]) for rng in self._rngs])
+            self._lost = _interrupted(self._lost, chance, sensing.gaps, sensing.gap_length)
+            presumed = _moved_on(self._past[:, 0], self.config.planner.dt)
+            newest = np.where(self._lost[..., None], presumed, newest)
+        self._past = np.concatenate([newest[:, None], self._past[:, :-1]], axis=1)
 
     def _normal(self, shape: tuple[int, ...]) -> np.ndarray:
         return np.stack([rng.normal(size=shape[1:]) for rng in self._rngs]) if self._rngs else np.zeros(shape)
+
+
+def _interrupted(interrupted: np.ndarray, chance: np.ndarray, share: float, length: float) -> np.ndarray:
+    """Return what is interrupted in the next step: a share of the time, for some steps on average.
+
+    :param interrupted: what is now
+    :param chance: uniform random numbers
+    """
+    ends = 1 / length
+    return np.where(interrupted, chance >= ends, chance < share * ends / (1 - share))
+
+
+def _moved_on(seen: np.ndarray, time: float | np.ndarray) -> np.ndarray:
+    """Return positions and velocities, (..., 6), after a time (s) of constant velocity."""
+    moved = np.broadcast_to(seen, np.broadcast_shapes(seen.shape, np.shape(time))).copy()
+    moved[..., :3] += time * seen[..., 3:]
+    return moved
 
 
 def _by_state(pos: float, vel: float, attitude: float) -> np.ndarray:

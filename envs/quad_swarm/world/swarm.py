@@ -136,7 +136,13 @@ class Swarm(SwarmState):
         plans = Plans.hover(state.reshape(-1, 9), horizon)
         plans_of_robots = plans.x.reshape(n_swarms, n, horizon + 1, 9)
         radio = config.radio
-        differ = radio.is_random or radio.limits_distance or radio.round_trip or config.sensing.others
+        differ = (
+            radio.is_random
+            or radio.limits_distance
+            or radio.round_trip
+            or config.sensing.others
+            or config.sensing.tracks
+        )
         super().__init__(
             state=state,
             goal=np.zeros((n_swarms, n, 3)),
@@ -213,12 +219,16 @@ class Swarm(SwarmState):
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (m) and velocities (m/s) of the others as each robot observes them, (E, n, n - 1, 3) each,
         world frame."""
-        return self.disturbances.observe(*self._seen_by_all())
+        return self.disturbances.observe(*self._others_of(self.disturbances.shown(self._estimate())))
 
     def _seen_by_all(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the same as `observe`, but without the additional errors of the observers."""
-        estimate, neighbours = self._estimate(), self.neighbours
-        seen = of_others(estimate, neighbours.others)
+        """Return where the others are by their own estimates, like `observe`. They do not know what others observe
+        besides."""
+        return self._others_of(self._estimate())
+
+    def _others_of(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        neighbours = self.neighbours
+        seen = of_others(states, neighbours.others)
         pos, vel = seen[..., POSITION], seen[..., VELOCITY]
         if neighbours.present is not None:
             pos[..., 0] += np.where(neighbours.present, 0.0, _EMPTY_SLOT * self.config.planner.separation)
@@ -343,7 +353,7 @@ class Swarm(SwarmState):
         self._u[swarm] = 0.0
         self._plant.place(swarm, self.state[swarm])
         if self.config.is_random:
-            self.disturbances.reset(swarm, noise_seed)
+            self.disturbances.reset(swarm, noise_seed, self.state[swarm])
         start, planner = self.disturbances.start, self.config.planner
         late = None if start is None else start[swarm] / self.config.substeps
         steady = Plans.steady(self.state[swarm], planner.horizon, planner.dt, late)
@@ -540,10 +550,8 @@ class Swarm(SwarmState):
             self.state = self._plant.step(self.state, self._u, disturbances.air, disturbances.factors)
             positions[k + 1] = self.pos
         if self.config.is_random:
-            kicks = disturbances.advance()
-            if kicks is not None:
-                self.state = self.state + kicks
-                positions[-1] = self.pos
+            self.state = disturbances.advance(self.state)
+            positions[-1] = self.pos
         return positions
 
     def _report(self, positions: np.ndarray, source: np.ndarray, solve_seconds: float) -> StepReport:

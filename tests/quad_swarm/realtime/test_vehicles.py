@@ -143,3 +143,22 @@ def test_vehicles_that_are_no_quadrotors_are_refused(monkeypatch):
     monkeypatch.setitem(PROBLEMS, "boat", foreign.Boat)
     with pytest.raises(ValueError, match="vehicles in real time level and land as quadrotors do"):
         Vehicles(make_config("flight", planner={"problem": "boat"}))
+
+
+def test_others_are_sensed_late_and_lost_between_the_periods_too():
+    def sensed(**sensing):
+        seen = []
+
+        def push(vehicles):
+            vehicles.command(0, np.array([0.0, 0.2, 0.0, 0.0]))
+            seen.append(vehicles.sensed(1))
+
+        flown(1.0, push, make_config("flight", {**CALM, "sensing": {**CALM["sensing"], **sensing}}, n_robots=2))
+        return np.array([one.state[0] for one in seen]), np.array([one.pos[0, 0] for one in seen])
+
+    (own, now), (own_late, late) = sensed(), sensed(others_delay=3)
+    assert np.array_equal(own_late, own)
+    assert 0.02 < (now - late).max() < 0.1, "a robot that accelerates is ahead of where it would be"
+    assert (np.diff(late)[-20:] > 0).all(), "it moves on between two periods"
+    _, lost = sensed(gaps=0.999, gap_length=1000)
+    assert 0.3 < (now - lost)[-1] < 1, "who was lost at rest is presumed there"

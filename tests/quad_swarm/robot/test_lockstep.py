@@ -102,6 +102,13 @@ def test_robots_fly_as_the_swarm_with_a_radio_that_distance_limits(radio, rule):
     assert not list(differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap"))
 
 
+@pytest.mark.parametrize("rule", ["full", "cpa:1.2s:3&stale:4", "stage:0.8:0.5|push:0.1"])
+@pytest.mark.parametrize("preset", ["flight-v2", "flight-v3"])
+def test_robots_fly_as_the_swarm_if_others_are_observed_late_and_lost(preset, rule):
+    config = make_config(preset, {"sensing": {"others_delay": 2, "gaps": 0.2}}, n_robots=4)
+    assert not list(differences(config, [RulePolicy(rule) for _ in range(4)], rule, "symmetric_swap"))
+
+
 UNLIKE = [{"radius": 0.2, "max_speed": 1.0, "max_yaw_rate": 1.0}, {"quadrotor": "x500"}, {"radius": 0.5}]
 
 

@@ -339,7 +339,7 @@ def test_neighbours_are_chosen_by_what_robots_observe(sensing, way, monkeypatch)
         assert [set(row) for row in swarm.neighbours.numbers_in(0).tolist()] == expected
     by_truth = 0
     for _ in range(20):
-        swarm.disturbances.advance()  # errors change, robots stay
+        swarm.disturbances.advance(swarm.state)  # errors change, robots stay
         expected = nearest_as_observed(swarm, 3)
         swarm._look_around()
         assert [set(row) for row in swarm.neighbours.numbers_in(0).tolist()] == expected

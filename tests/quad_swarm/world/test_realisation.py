@@ -12,7 +12,16 @@ from quad_swarm.world.swarm import Swarm
 EVERYTHING = {
     "substeps": 5,
     "noise": {"pos": 0.002, "vel": 0.02, "attitude": 0.005, "wind": 1.0, "gust": 0.5},
-    "sensing": {"pos": 0.01, "vel": 0.05, "attitude": 0.01, "others_pos": 0.01, "others_vel": 0.05},
+    "sensing": {
+        "pos": 0.01,
+        "vel": 0.05,
+        "attitude": 0.01,
+        "others_pos": 0.01,
+        "others_vel": 0.05,
+        "others_delay": 2,
+        "gaps": 0.1,
+        "gap_length": 5,
+    },
     "radio": {
         "loss": 0.2,
         "delay": 1,
@@ -31,7 +40,7 @@ def drawn(n_swarms: int = 200, **world) -> tuple[SwarmConfig, Realisation]:
     config = make_config(world=world)
     chance = Realisation(config, n_swarms)
     for k in range(n_swarms):
-        chance.reset(k, seed=k)
+        chance.reset(k, k, np.zeros((config.n_robots, 9)))
     return config, chance
 
 
@@ -73,7 +82,7 @@ def test_errors_are_stationary_and_forgotten_in_the_time_given(correlation_time)
     state, pos = np.zeros((400, 4, 9)), np.zeros((400, 4, 3, 3))
     own, seen = [chance.estimate(state)], [chance.observe(pos, pos)[0]]
     for _ in range(5):
-        assert chance.advance() is None
+        assert chance.advance(state) is state, "there is no process noise"
         own.append(chance.estimate(state))
         seen.append(chance.observe(pos, pos)[0])
     for step in (0, 5):
@@ -151,7 +160,7 @@ def test_silent_robots_answer_nobody_and_stay_silent():
     answers = []
     for _ in range(round(OUTAGE_WITHIN / config.planner.dt) + 1):
         answers.append(chance.arrivals(requests, others)[0])
-        chance.advance()
+        chance.advance(np.zeros((100, 4, 9)))
     silent = np.zeros((len(answers), 100, 4), bool)
     for robot in range(4):
         silent[..., robot] = ~np.stack([a[:, others == robot] for a in answers]).any(axis=-1)
@@ -227,3 +236,70 @@ def test_robots_see_estimates_and_not_the_truth():
     swarm.planner.plan = lambda problems, last: asked.append(problems) or plan(problems, last)
     swarm.step(np.zeros((2, 4, 3), bool))
     assert np.array_equal(asked[0].x.reshape(2, 4, 9), estimate)
+
+
+def test_others_are_observed_where_they_would_be_since_a_delay():
+    swarm = make_swarm(3, sensing={"others_delay": 2, "pos": 0.01, "vel": 0.05})
+    dt, own = swarm.config.planner.dt, [swarm.estimate()]
+    for k in range(12):
+        pos, vel = swarm.observe()
+        if k >= 2:
+            then = own[-3][:, swarm.neighbours.others]
+            np.testing.assert_allclose(vel, then[..., 3:6])
+            np.testing.assert_allclose(pos, then[..., :3] + 2 * dt * then[..., 3:6])
+            assert np.abs(pos - swarm.pos[:, swarm.neighbours.others]).max() > 1e-3
+        fly(swarm, 1)
+        own.append(swarm.estimate())
+    # What they know of themselves is not late
+    assert np.array_equal(swarm._seen_by_all()[0], own[-1][:, swarm.neighbours.others][..., :3])
+
+
+def test_a_robot_that_was_observed_before_the_start_had_flown_steadily():
+    config, chance = drawn(1, sensing={"others_delay": 3})
+    states = np.random.default_rng(0).normal(size=(config.n_robots, 9))
+    chance.reset(0, 0, states)
+    np.testing.assert_allclose(chance.shown(states[None])[0], states[:, :6])
+
+
+def test_a_lost_robot_flies_on_in_the_eyes_of_all_others():
+    swarm = make_swarm(1, sensing={"gaps": 0.3, "gap_length": 4})
+    dt, gaps = swarm.config.planner.dt, 0
+    pos, vel = swarm.observe()
+    for _ in range(40):
+        fly(swarm, 1)
+        steady, kept, (pos, vel) = pos + dt * vel, vel, swarm.observe()
+        lost = swarm.disturbances._lost[:, swarm.neighbours.others]
+        true = swarm.pos[:, swarm.neighbours.others]
+        np.testing.assert_allclose(pos, np.where(lost[..., None], steady, true))
+        np.testing.assert_array_equal(vel[lost], kept[lost])
+        gaps += lost.sum()
+    assert gaps
+
+
+def test_robots_are_lost_for_the_share_and_the_length_given():
+    config, chance = drawn(300, sensing={"gaps": 0.2, "gap_length": 5})
+    states, lost = np.zeros((300, config.n_robots, 9)), []
+    for _ in range(200):
+        lost.append(chance._lost)
+        states = chance.advance(states)
+    lost = np.array(lost)
+    assert not lost[0].any(), "robots know where everybody starts"
+    assert lost[50:].mean() == pytest.approx(0.2, abs=0.01)
+    ends = (lost[50:-1] & ~lost[51:]).sum()
+    assert lost[50:].sum() / ends == pytest.approx(5, rel=0.05)
+
+
+def test_what_limited_neighbourhoods_perceive_is_not_late():
+    world = {"neighbourhood": {"max_others": 2}}
+    for sensing in ({"others_delay": 1}, {"gaps": 0.1}):
+        with pytest.raises(ValueError, match=r"for robots that perceive all others; set them to 0"):
+            make_config(world={**world, "sensing": sensing})
+
+
+def test_a_state_from_before_robots_could_be_lost_is_restored():
+    world = {"noise": {"wind": 1.0}}
+    _, chance = drawn(2, **world)
+    state = {name: value for name, value in chance.state_dict().items() if name not in ("lost", "past")}
+    other = Realisation(chance.config, 2)
+    other.load_state_dict(state)
+    assert np.array_equal(other.air, chance.air)
