@@ -32,10 +32,12 @@ robots: the packaged model of version 2, nobody, everybody, and a rule that tell
 foreign simulators, and with 24 and 32 robots; set 724 ``third_seeds_SIZE``, all scenarios in `flight-v3` with the
 recipe's other training seeds; set 726 ``third_random_SIZE``, robots that ask at random about as often as the model
 sends; set 727 ``third_more_SIZE``, the packaged model as in set 722, for 12,000 flights of eight robots and 4,000 of
-other numbers in all. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before robots of version
-3 kept right of predicted others; set 721 never flew. All parts before set 706 fly with equal penalties, those before
-set 709 without the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of
-`summarise`; written after each row, so that a run that is ended keeps what it has.
+other numbers in all. Set 729 is ``late_1``, ``late_2``, ``late_4`` and ``lost``, eight robots in `flight-v3` that
+observe others 50, 100 or 200 ms late, or lose them from sight for a tenth of the time. Set 720 (``third_model_eight``
+and ``third_none_eight``) flew at 2fd9813, before robots of version 3 kept right of predicted others; set 721 never
+flew. All parts before set 706 fly with equal penalties, those before set 709 without the reserve, as they did. JSON:
+one row per policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run
+that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE, MOST = (
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE, MOST, LATE = (
     713,
     *range(715, 720),
     722,
@@ -69,6 +71,7 @@ RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE
     724,
     726,
     727,
+    729,
 )
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
@@ -225,6 +228,21 @@ PARTS |= {
     f"third_random_{size}": Part(("random:0.003",), EVERYWHERE, (SIZES[size],), 2000, CHANCE, preset="flight-v3")
     for size in ("twelve", "sixteen")
 }
+# Others are observed late, or lost from sight; the lower threshold was chosen on set 79, with 200 ms
+LOWER = f"{pretrained_folder('quad-swarm-flight-v2') / 'model.zip'}@0.3"
+_SIGHT = {f"late_{steps}": {"others_delay": steps} for steps in (1, 2, 4)} | {"lost": {"gaps": 0.1}}
+PARTS |= {
+    name: Part(
+        ("none", THIRD_POLICIES["rule"], THIRD_POLICIES["model"], LOWER, "full"),
+        ("symmetric_swap", "forest", "crossing_traffic"),
+        (8,),
+        1000,
+        LATE,
+        changes={"sensing": sensing},
+        preset="flight-v3",
+    )
+    for name, sensing in _SIGHT.items()
+}
 # What set 722 lacks of 12,000 flights of eight robots and 4,000 of other numbers
 PARTS |= {
     f"third_more_{size}": Part(
@@ -275,7 +293,10 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
                 fly_piece = partial(delay_check.fly, checked, scenario, CLEARANCE)
                 flown[DELAY_CHECK] = [row for rows in executor.map(fly_piece, pieces) for row in rows]
             for policy, rows in flown.items():
-                keys = {"policy": named(policy), "scenario": scenario, "n_robots": n, "plant": part.plant}
+                keys: dict[str, Any] = {"policy": named(policy), "scenario": scenario, "n_robots": n}
+                keys["plant"] = part.plant
+                if part.set == LATE:
+                    keys["changes"] = part.changes
                 yield (
                     keys
                     | {"vehicle": part.vehicle, "set": part.set, "hard": part.changes is HARD, "preset": part.preset}
