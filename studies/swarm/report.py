@@ -49,6 +49,8 @@ from studies.swarm.version2 import (
     BRAKING,
     CHEAP_RULES,
     ELSEWHERE,
+    LATE,
+    LOWER,
     MASK_ONLY,
     ORCA,
     OWN_MODEL,
@@ -706,6 +708,39 @@ def anticipation_table(rows: Rows) -> str:
     return table(["scenario", *(f"{n} robots" for n in sizes)], lines)
 
 
+def late_table(rows: Rows) -> str:
+    """Format flights in which others are observed late or lost from sight: collisions, plans sent, and arrival beside
+    full communication.
+
+    :param rows: rows of one set, with the fields of the world under ``changes``
+    """
+    policies = {
+        "nobody": "none",
+        f"`{THIRD_POLICIES['rule']}`": THIRD_POLICIES["rule"],
+        "model at 0.6": named(THIRD_POLICIES["model"]),
+        "model at 0.3": named(LOWER),
+        "everybody": FULL,
+    }
+    worlds: dict[str, Rows] = {}
+    for row in rows:
+        worlds.setdefault(changes(row["changes"]), []).append(row)
+    lines = []
+    for changed, flown in sorted(worlds.items()):
+        for name in dict.fromkeys(row["scenario"] for row in flown):
+            here = {row["policy"]: row for row in flown if row["scenario"] == name}
+            line = [f"`{changed}`", name.replace("_", " ")]
+            for policy in policies.values():
+                one, full = here[policy], here[FULL]
+                parts = [f"{one['collisions']:,}"]
+                if policy not in ("none", FULL):
+                    parts.append(f"{one['request_share']:.2%}")
+                if policy != FULL:
+                    parts.append(f"{one['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%"))
+                line.append("; ".join(parts).replace(" ", "&nbsp;"))
+            lines.append(line)
+    return table(["world", "scenario", *policies], lines)
+
+
 def judged(own: dict[str, Any], full: dict[str, Any]) -> str:
     """Format collisions, with a mark unless they are within the margin of full communication."""
     counts = [one[key] for one in (own, full) for key in ("collisions", "episodes")]
@@ -876,6 +911,7 @@ def main() -> None:
         "cells": cells_table(sealed_2),
         "obstacles": obstacles_table(sealed_2),
         "anticipation": anticipation_table(sealed_3),
+        "late": late_table([row for row in read_rows(VERSION_2 / "version3.json") if row["set"] == LATE]),
         "front": front_table(sealed_2, sealed_3, "docs/planner.md"),
         "front results": front_table(sealed_2, sealed_3, "planner.md"),
         "flight": flight_table(rows["flight"]),

@@ -346,6 +346,35 @@ def test_tables_of_version_3_say_who_sends_and_what_it_costs():
     assert first.strip("| ").split(" | ")[2] == "*nobody:* 5"
 
 
+def test_the_table_of_late_perception_compares_within_each_world():
+    def row(policy: str, collisions: int, share: float, steps: float, **sensing) -> dict:
+        figures = {"scenario": "forest", "policy": version2.named(policy), "episodes": 1000, "collisions": collisions}
+        return figures | {"request_share": share, "steps_to_arrival": steps, "changes": {"sensing": sensing}}
+
+    rule, model = version2.THIRD_POLICIES["rule"], version2.THIRD_POLICIES["model"]
+    rows = [
+        row("none", 400, 0.0, 110.0, others_delay=4),
+        row(rule, 2, 0.01, 105.0, others_delay=4),
+        row(model, 90, 0.0097, 105.8, others_delay=4),
+        row(version2.LOWER, 0, 0.036, 101.3, others_delay=4),
+        row("full", 0, 1.0, 100.0, others_delay=4),
+    ]
+    rows += [row(name, 0, 0.5, 90.0, gaps=0.1) for name in ("none", rule, model, version2.LOWER, "full")]
+    head, _, first, second = report.late_table(rows).replace("&nbsp;", " ").splitlines()
+    cells = [line.strip("| ").split(" | ") for line in (head, first, second)]
+    assert cells[0] == ["world", "scenario", "nobody", f"`{rule}`", "model at 0.6", "model at 0.3", "everybody"]
+    assert cells[2] == [
+        "`sensing.others_delay=4`",
+        "forest",
+        "400; +10%",
+        "2; 1.00%; +5%",
+        "90; 0.97%; +6%",
+        "0; 3.60%; +1%",
+        "0",
+    ]
+    assert cells[1][:3] == ["`sensing.gaps=0.1`", "forest", "0; +0%"]
+
+
 def test_a_delay_check_needs_a_longest_delay():
     with pytest.raises(ValueError, match=r"radio\.jitter=1"):
         delay_check.DelayCheckedSwarm(make_config("flight"), 1, clearance=0.62)

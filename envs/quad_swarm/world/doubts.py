@@ -423,19 +423,22 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
 
 
 def moving_alike(config: SwarmConfig) -> dict[str, Any]:
-    """Return the fields of a world on which it depends how its robots move, by the names that ``--world`` has, as
-    JSON has them. They hardly fly along the walls of the workspace."""
+    """Return the fields of a world on which it depends how its robots move, and when they are seen, by the names that
+    ``--world`` has, as JSON has them. They hardly fly along the walls of the workspace."""
     nested = {name: dataclasses.asdict(getattr(config, name)) for name in ("planner", "quadrotor")}
     named = {f"{name}.{field}": value for name, fields in nested.items() for field, value in fields.items()}
     walls = {"planner.workspace_low", "planner.workspace_high"}
     known = {name: value for name, value in named.items() if name not in walls}
-    return json.loads(json.dumps({"radius": config.radius, **known}))
+    seen = {f"sensing.{name}": getattr(config.sensing, name) for name in ("others_delay", "gaps")}
+    return json.loads(json.dumps({"radius": config.radius, **known, **seen}))
 
 
 def _doubts_about_predictions(config: SwarmConfig) -> Iterator[str]:
     if config.predictor is None:
         return
     trained, here = load_predictor(config.predictor).trained_in, moving_alike(config)
+    if trained:  # older files do not say that nothing was late or lost
+        trained = {"sensing.others_delay": 0, "sensing.gaps": 0.0, **trained}
     others = [name for name, value in here.items() if trained.get(name, value) != value]
     if others:
         name = others[0]

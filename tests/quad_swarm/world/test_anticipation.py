@@ -299,8 +299,13 @@ def test_what_a_network_was_trained_in_is_said_and_other_worlds_are_doubtful(tmp
         make_config("flight-v3", planner={"max_speed": 3.0})
     with pytest.warns(DoubtfulWorld, match=r"quadrotor.drag_x=0.25 instead of 0.0142 and 7 other fields"):
         make_config("flight-v3", quadrotor="x500")
+    with pytest.warns(DoubtfulWorld, match=r"sensing\.others_delay=0 instead of 4: .*train one for this world"):
+        make_config("flight-v3", sensing={"others_delay": 4})
+    with pytest.warns(DoubtfulWorld, match=r"sensing\.gaps=0\.0 instead of 0\.1"):
+        make_config("flight-v3", sensing={"gaps": 0.1})
     # Of a network that does not say it, nothing is known
     network().save(tmp_path / "mine.npz")
     recwarn.clear()
+    make_config("flight-v2", predictor=str(tmp_path / "mine.npz"), sensing={"others_delay": 4})
     make_config("flight-v2", predictor=str(tmp_path / "mine.npz"), planner={"max_speed": 3.0})
     assert not recwarn.list
