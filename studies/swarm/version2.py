@@ -33,11 +33,11 @@ foreign simulators, and with 24 and 32 robots; set 724 ``third_seeds_SIZE``, all
 recipe's other training seeds; set 726 ``third_random_SIZE``, robots that ask at random about as often as the model
 sends; set 727 ``third_more_SIZE``, the packaged model as in set 722, for 12,000 flights of eight robots and 4,000 of
 other numbers in all. Set 729 is ``late_1``, ``late_2``, ``late_4`` and ``lost``, eight robots in `flight-v3` that
-observe others 50, 100 or 200 ms late, or lose them from sight for a tenth of the time. Set 720 (``third_model_eight``
-and ``third_none_eight``) flew at 2fd9813, before robots of version 3 kept right of predicted others; set 721 never
-flew. All parts before set 706 fly with equal penalties, those before set 709 without the reserve, as they did. JSON:
-one row per policy, scenario and number of robots with the keys of `summarise`; written after each row, so that a run
-that is ended keeps what it has.
+observe others 50, 100 or 200 ms late, or lose them from sight for a tenth of the time; set 730 ``late_learned``, 200 ms
+late with a network that learned so. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before
+robots of version 3 kept right of predicted others; set 721 never flew. All parts before set 706 fly with equal
+penalties, those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and number of
+robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE, MOST, LATE = (
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE, MOST, LATE, LEARNED_LATE = (
     713,
     *range(715, 720),
     722,
@@ -72,6 +72,7 @@ RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE
     726,
     727,
     729,
+    730,
 )
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
@@ -243,6 +244,17 @@ PARTS |= {
     )
     for name, sensing in _SIGHT.items()
 }
+# With a network that learned from robots that observe others so late
+LATE_NETWORK = "studies/data/late_perception.npz"
+PARTS["late_learned"] = Part(
+    ("none", THIRD_POLICIES["rule"], THIRD_POLICIES["model"], "full"),
+    ("symmetric_swap", "forest", "crossing_traffic"),
+    (8,),
+    1000,
+    LEARNED_LATE,
+    changes={"sensing": {"others_delay": 4}, "predictor": LATE_NETWORK},
+    preset="flight-v3",
+)
 # What set 722 lacks of 12,000 flights of eight robots and 4,000 of other numbers
 PARTS |= {
     f"third_more_{size}": Part(
@@ -295,7 +307,7 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
             for policy, rows in flown.items():
                 keys: dict[str, Any] = {"policy": named(policy), "scenario": scenario, "n_robots": n}
                 keys["plant"] = part.plant
-                if part.set == LATE:
+                if part.set in (LATE, LEARNED_LATE):
                     keys["changes"] = part.changes
                 yield (
                     keys
