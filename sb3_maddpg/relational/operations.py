@@ -74,12 +74,12 @@ def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th
     :return: x @ weight.T + bias, (..., out)
     """
     if (
-        not _HAS_ONEDNN
+        _is_exported()  # first, since exported programs hold for any number of rows only if nobody asks
+        or not _HAS_ONEDNN
         or x.shape[:-1].numel() < _FEWEST_ROWS
         or not x.dtype == weight.dtype == th.float32
         or not x.device.type == weight.device.type == "cpu"
         or th.is_autocast_enabled("cpu")
-        or _is_exported()
     ):
         return F.linear(x, weight, bias)
     return _Linear.apply(x, weight, bias)

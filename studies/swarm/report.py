@@ -49,7 +49,7 @@ from studies.swarm.version2 import (
     BRAKING,
     CHEAP_RULES,
     ELSEWHERE,
-    LATE,
+    LATE_NETWORK,
     LOWER,
     MASK_ONLY,
     ORCA,
@@ -712,7 +712,7 @@ def late_table(rows: Rows) -> str:
     """Format flights in which others are observed late or lost from sight: collisions, plans sent, and arrival beside
     full communication.
 
-    :param rows: rows of one set, with the fields of the world under ``changes``
+    :param rows: rows with the fields of the world under ``changes``
     """
     policies = {
         "nobody": "none",
@@ -723,15 +723,17 @@ def late_table(rows: Rows) -> str:
     }
     worlds: dict[str, Rows] = {}
     for row in rows:
-        worlds.setdefault(changes(row["changes"]), []).append(row)
+        worlds.setdefault(changes(row["changes"]).replace(LATE_NETWORK, Path(LATE_NETWORK).name), []).append(row)
     lines = []
-    for changed, flown in sorted(worlds.items()):
+    for changed, flown in worlds.items():
         for name in dict.fromkeys(row["scenario"] for row in flown):
             here = {row["policy"]: row for row in flown if row["scenario"] == name}
             line = [f"`{changed}`", name.replace("_", " ")]
             for policy in policies.values():
-                one, full = here[policy], here[FULL]
-                parts = [f"{one['collisions']:,}"]
+                if (one := here.get(policy)) is None:
+                    line.append("")
+                    continue
+                full, parts = here[FULL], [f"{one['collisions']:,}"]
                 if policy not in ("none", FULL):
                     parts.append(f"{one['request_share']:.2%}")
                 if policy != FULL:
@@ -911,7 +913,7 @@ def main() -> None:
         "cells": cells_table(sealed_2),
         "obstacles": obstacles_table(sealed_2),
         "anticipation": anticipation_table(sealed_3),
-        "late": late_table([row for row in read_rows(VERSION_2 / "version3.json") if row["set"] == LATE]),
+        "late": late_table([row for row in read_rows(VERSION_2 / "version3.json") if "changes" in row]),
         "front": front_table(sealed_2, sealed_3, "docs/planner.md"),
         "front results": front_table(sealed_2, sealed_3, "planner.md"),
         "flight": flight_table(rows["flight"]),

@@ -361,10 +361,11 @@ def test_the_table_of_late_perception_compares_within_each_world():
         row("full", 0, 1.0, 100.0, others_delay=4),
     ]
     rows += [row(name, 0, 0.5, 90.0, gaps=0.1) for name in ("none", rule, model, version2.LOWER, "full")]
-    head, _, first, second = report.late_table(rows).replace("&nbsp;", " ").splitlines()
-    cells = [line.strip("| ").split(" | ") for line in (head, first, second)]
+    rows += [row(name, 0, 0.5, 90.0) | {"changes": {"predictor": version2.LATE_NETWORK}} for name in ("none", "full")]
+    head, _, *lines = report.late_table(rows).replace("&nbsp;", " ").splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in (head, *lines)]
     assert cells[0] == ["world", "scenario", "nobody", f"`{rule}`", "model at 0.6", "model at 0.3", "everybody"]
-    assert cells[2] == [
+    assert cells[1] == [
         "`sensing.others_delay=4`",
         "forest",
         "400; +10%",
@@ -373,7 +374,8 @@ def test_the_table_of_late_perception_compares_within_each_world():
         "0; 3.60%; +1%",
         "0",
     ]
-    assert cells[1][:3] == ["`sensing.gaps=0.1`", "forest", "0; +0%"]
+    assert cells[2][:3] == ["`sensing.gaps=0.1`", "forest", "0; +0%"]
+    assert cells[3] == ["`predictor=late_perception.npz`", "forest", "0; +0%", "", "", "", "0"]
 
 
 def test_a_delay_check_needs_a_longest_delay():

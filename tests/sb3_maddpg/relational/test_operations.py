@@ -78,3 +78,21 @@ def test_the_largest_and_who_gets_its_gradient():
     x = th.randn(20, 3, 13, 8, requires_grad=True)
     gradients = [th.autograd.grad(function(x).square().sum(), x)[0] for function in (largest, lambda y: y.amax(-2))]
     assert th.equal(*gradients)
+
+
+def test_exported_programs_hold_for_any_number_of_rows():
+    class Net(th.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layer = Linear(6, 4)
+
+        def forward(self, x):
+            return largest(self.layer(x))
+
+    net = Net()
+    script = th.jit.trace(net, th.randn(2, 1, 6))
+    program = th.export.export(net, (th.randn(2, 1, 6),), dynamic_shapes=({0: th.export.Dim("batch")},)).module()
+    for rows in (1, 2, 7, 500):
+        x = th.randn(rows, 1, 6)
+        for exported in (script, program):
+            th.testing.assert_close(exported(x), F.linear(x, net.layer.weight, net.layer.bias).amax(dim=-2))
