@@ -49,7 +49,6 @@ from studies.swarm.version2 import (
     BRAKING,
     CHEAP_RULES,
     ELSEWHERE,
-    LATE_NETWORK,
     LOWER,
     MASK_ONLY,
     ORCA,
@@ -723,12 +722,15 @@ def late_table(rows: Rows) -> str:
     }
     worlds: dict[str, Rows] = {}
     for row in rows:
-        worlds.setdefault(changes(row["changes"]).replace(LATE_NETWORK, Path(LATE_NETWORK).name), []).append(row)
+        late = row["changes"]["sensing"].get("others_delay")
+        seen = "lost at times" if late is None else f"{1000 * PRESETS[row['preset']].planner.dt * late:.0f} ms late"
+        learned = ", and the network learned so" if "predictor" in row["changes"] else ""
+        worlds.setdefault(seen + learned, []).append(row)
     lines = []
     for changed, flown in worlds.items():
         for name in dict.fromkeys(row["scenario"] for row in flown):
             here = {row["policy"]: row for row in flown if row["scenario"] == name}
-            line = [f"`{changed}`", name.replace("_", " ")]
+            line = [changed, name.replace("_", " ")]
             for policy in policies.values():
                 if (one := here.get(policy)) is None:
                     line.append("")
@@ -740,7 +742,7 @@ def late_table(rows: Rows) -> str:
                     parts.append(f"{one['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%"))
                 line.append("; ".join(parts).replace(" ", "&nbsp;"))
             lines.append(line)
-    return table(["world", "scenario", *policies], lines)
+    return table(["others are seen", "scenario", *policies], lines)
 
 
 def judged(own: dict[str, Any], full: dict[str, Any]) -> str:

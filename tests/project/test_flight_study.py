@@ -350,7 +350,12 @@ def test_tables_of_version_3_say_who_sends_and_what_it_costs():
 def test_the_table_of_late_perception_compares_within_each_world():
     def row(policy: str, collisions: int, share: float, steps: float, **sensing) -> dict:
         figures = {"scenario": "forest", "policy": version2.named(policy), "episodes": 1000, "collisions": collisions}
-        return figures | {"request_share": share, "steps_to_arrival": steps, "changes": {"sensing": sensing}}
+        return figures | {
+            "request_share": share,
+            "steps_to_arrival": steps,
+            "changes": {"sensing": sensing},
+            "preset": "flight-v3",
+        }
 
     rule, model = version2.THIRD_POLICIES["rule"], version2.THIRD_POLICIES["model"]
     rows = [
@@ -361,12 +366,21 @@ def test_the_table_of_late_perception_compares_within_each_world():
         row("full", 0, 1.0, 100.0, others_delay=4),
     ]
     rows += [row(name, 0, 0.5, 90.0, gaps=0.1) for name in ("none", rule, model, version2.LOWER, "full")]
-    rows += [row(name, 0, 0.5, 90.0) | {"changes": {"predictor": version2.LATE_NETWORK}} for name in ("none", "full")]
+    learned = {"changes": {"sensing": {"others_delay": 4}, "predictor": version2.LATE_NETWORK}}
+    rows += [row(name, 0, 0.5, 90.0) | learned for name in ("none", "full")]
     head, _, *lines = report.late_table(rows).replace("&nbsp;", " ").splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in (head, *lines)]
-    assert cells[0] == ["world", "scenario", "nobody", f"`{rule}`", "model at 0.6", "model at 0.3", "everybody"]
+    assert cells[0] == [
+        "others are seen",
+        "scenario",
+        "nobody",
+        f"`{rule}`",
+        "model at 0.6",
+        "model at 0.3",
+        "everybody",
+    ]
     assert cells[1] == [
-        "`sensing.others_delay=4`",
+        "200 ms late",
         "forest",
         "400; +10%",
         "2; 1.00%; +5%",
@@ -374,8 +388,8 @@ def test_the_table_of_late_perception_compares_within_each_world():
         "0; 3.60%; +1%",
         "0",
     ]
-    assert cells[2][:3] == ["`sensing.gaps=0.1`", "forest", "0; +0%"]
-    assert cells[3] == ["`predictor=late_perception.npz`", "forest", "0; +0%", "", "", "", "0"]
+    assert cells[2][:3] == ["lost at times", "forest", "0; +0%"]
+    assert cells[3] == ["200 ms late, and the network learned so", "forest", "0; +0%", "", "", "", "0"]
 
 
 def test_a_delay_check_needs_a_longest_delay():
