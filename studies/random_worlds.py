@@ -101,7 +101,8 @@ _FIELDS: dict[str, dict[str, Any]] = {
     },
     "sensing": {
         "pos": _real(0, 1e3), "vel": _real(0, 1e3), "attitude": _real(0, 3.14), "others_pos": _real(0, 1e3),
-        "others_vel": _real(0, 1e3), "correlation_time": _real(0, 10),
+        "others_vel": _real(0, 1e3), "correlation_time": _real(0, 10), "others_delay": _whole(0, 30),
+        "gaps": _real(0, 0.99), "gap_length": _real(1, 100),
     },
     "radio": {
         "loss": _real(0, 1), "delay": _whole(0, 30), "jitter": _whole(0, 10), "bursts": _real(0, 0.99),

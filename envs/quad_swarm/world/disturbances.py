@@ -20,6 +20,15 @@ Disturbance = Annotated[float, Field(ge=0, le=1e3)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
+def _check_interruptions(name: str, share: float, name_of_length: str, length: float) -> None:
+    """Check that interruptions take a share of the time: there is a step between two of them."""
+    if share > length / (length + 1):
+        raise ValueError(
+            f"{name}={share:g}: with a step between two of them, interruptions of {length:g} steps take at most "
+            f"{length / (length + 1):.3g} of the time; raise {name_of_length} to at least {share / (1 - share):.3g}"
+        )
+
+
 @checked
 @dataclass(frozen=True)
 class ProcessNoise:
@@ -67,7 +76,7 @@ class SensingError:
     :param gaps: fraction of the time in which a robot is lost, independently of other robots; at the start, none is
     :param gap_length: mean length of a gap (steps)
     :raises ValueError: if a value is negative, not finite, or above 1000 (pi for the attitude, below 1 for ``gaps``),
-        or ``gap_length`` is less than a step
+        or ``gap_length`` is less than a step, or too short for ``gaps``
     """
 
     pos: Disturbance = 0.0
@@ -79,6 +88,9 @@ class SensingError:
     others_delay: Annotated[int, Field(ge=0, le=1000)] = 0
     gaps: Annotated[float, Field(ge=0, lt=1)] = 0.0
     gap_length: Annotated[float, Field(ge=1)] = 10.0
+
+    def __post_init__(self) -> None:
+        _check_interruptions("sensing.gaps", self.gaps, "sensing.gap_length", self.gap_length)
 
     @functools.cached_property
     def own(self) -> bool:
@@ -130,8 +142,8 @@ class Radio:
     :param outage: probability that a robot stops answering for good, at a time drawn uniformly from the first 5 s; it
         still flies and makes requests
     :raises ValueError: if a probability is outside [0, 1] (``bursts``: [0, 1)), a delay is outside 0 to 1000,
-        ``burst_length`` is less than a step, a distance is not positive, ``path_loss_exponent`` is outside 1 to 10, or
-        there are both ``delay`` and ``round_trip``
+        ``burst_length`` is less than a step or too short for ``bursts``, a distance is not positive,
+        ``path_loss_exponent`` is outside 1 to 10, or there are both ``delay`` and ``round_trip``
     """
 
     loss: Share = 0.0
@@ -146,6 +158,7 @@ class Radio:
     path_loss_exponent: Annotated[float, Field(ge=1, le=10)] = 3.0
 
     def __post_init__(self) -> None:
+        _check_interruptions("radio.bursts", self.bursts, "radio.burst_length", self.burst_length)
         if self.round_trip is not None and self.delay:
             raise ValueError(
                 f"radio.round_trip={self.round_trip} and radio.delay={self.delay} both say when answers count: give "

@@ -303,3 +303,16 @@ def test_a_state_from_before_robots_could_be_lost_is_restored():
     other = Realisation(chance.config, 2)
     other.load_state_dict(state)
     assert np.array_equal(other.air, chance.air)
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    [
+        ({"sensing": {"gaps": 0.9, "gap_length": 4}}, r"sensing\.gaps=0\.9: .*at most 0\.8 .*gap_length to at least 9"),
+        ({"radio": {"bursts": 0.6, "burst_length": 1}}, r"radio\.bursts=0\.6: .*burst_length to at least 1\.5"),
+    ],
+)
+def test_interruptions_that_are_too_short_for_their_share_are_refused(world, message):
+    with pytest.raises(ValueError, match=message):
+        make_config(world=world)
+    make_config(world={"sensing": {"gaps": 0.5, "gap_length": 1}, "radio": {"bursts": 0.5, "burst_length": 1}})
