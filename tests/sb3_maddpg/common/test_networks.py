@@ -5,7 +5,7 @@ import torch as th
 from stable_baselines3.common.utils import polyak_update as sb3_polyak_update
 from torch import nn
 
-from sb3_maddpg.common.networks import StackedMLP, polyak_update
+from sb3_maddpg.common.networks import FEW, StackedMLP, polyak_update
 
 N, D, B = 4, 5, 6
 GROUPS = {"separate": [0, 1, 2, 3], "shared": [0, 0, 0, 0], "grouped": [0, 1, 1, 0]}
@@ -14,9 +14,10 @@ each_sharing = pytest.mark.parametrize("groups", GROUPS.values(), ids=GROUPS)
 
 @pytest.mark.parametrize("net_arch", [[], [8], [16, 8]])
 @each_sharing
-def test_stacked_networks_equal_a_loop_of_separate_ones(net_arch, groups):
+@pytest.mark.parametrize("batch", [1, FEW - 1, FEW])
+def test_stacked_networks_equal_a_loop_of_separate_ones(net_arch, groups, batch):
     stacked = StackedMLP(groups, D, 2, net_arch, nn.Tanh)
-    x = th.randn(N, D, B)
+    x = th.randn(batch, N, D).permute(1, 2, 0)  # as actors pass them
     for agent, group in enumerate(groups):
         y = x[agent].T
         for index, (weight, bias) in enumerate(zip(stacked.weights, stacked.biases, strict=True)):
