@@ -12,7 +12,6 @@ import numpy as np
 
 from quad_swarm.errors import shown
 from quad_swarm.geometry import length, wrapped
-from quad_swarm.planner.cost import PlanCost
 from quad_swarm.planner.model import ProblemModel
 from quad_swarm.planner.problem import PlannerConfig, Problems
 from quad_swarm.planner.right_of_way import keep_right
@@ -139,7 +138,7 @@ class Planner:
         self.config = config
         self.n_others = n_others
         self.checks = True
-        self.rate: PlanCost | None = None
+        self.rate: Callable[[Problems, np.ndarray, np.ndarray], np.ndarray] | None = None
         self.prepare: Callable[[Problems], Problems] | None = None
         self.costs: np.ndarray | None = None
 

@@ -251,10 +251,10 @@ def test_what_robots_lose_on_the_way_counts_for_those_who_are_near():
     planner = {"max_speed": 2.0, "dt": 0.05}
     env = QuadSwarmEnv(n_robots=3, world={"planner": planner}, reward={"goal": 0, "request": 0, "delay": 0.5})
     starts = np.array([[-2.0, 0, 1], [-2.0, 1.0, 1], [-2.0, 4.0, 1]])
-    env.reset(options={"starts": starts, "goals": starts + [4.0, 0, 0]})
+    goals = starts + np.array([4.0, 0, 0])
+    env.reset(options={"starts": starts, "goals": goals})
     before = env.task.swarm.state[0, :, :3].copy()
     _, reward, *_, info = env.step(np.zeros(6, np.int8))
-    goals = starts + [4.0, 0, 0]
     after = env.task.swarm.state[0, :, :3]
     progress = np.linalg.norm(before - goals, axis=1) - np.linalg.norm(after - goals, axis=1)
     lost = 1 - progress / (2.0 * 0.05)
