@@ -208,7 +208,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of episodes and actor (default %(default)s)")
     options = parser.parse_args()
     started = time.perf_counter()
-    train(options).save(options.out)
+    train(options).save(options.out, lean="actor")
     print(f"{options.out}: {time.perf_counter() - started:.0f} s")
 
 

@@ -34,10 +34,12 @@ recipe's other training seeds; set 726 ``third_random_SIZE``, robots that ask at
 sends; set 727 ``third_more_SIZE``, the packaged model as in set 722, for 12,000 flights of eight robots and 4,000 of
 other numbers in all. Set 729 is ``late_1``, ``late_2``, ``late_4`` and ``lost``, eight robots in `flight-v3` that
 observe others 50, 100 or 200 ms late, or lose them from sight for a tenth of the time; set 730 ``late_learned``, 200 ms
-late with a network that learned so. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before
-robots of version 3 kept right of predicted others; set 721 never flew. All parts before set 706 fly with equal
-penalties, those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and number of
-robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
+late with a network that learned so. Set 731 is ``timely_SIZE`` and ``timely_model_SIZE``, all scenarios in `flight-v3`
+without commitment: nobody, everybody, a rule that tells much, and a model that knows which plans change others. Set 720
+(``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before robots of version 3 kept right of predicted
+others; set 721 never flew. All parts before set 706 fly with equal penalties, those before set 709 without the reserve,
+as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written after each
+row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -63,7 +65,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE, MOST, LATE, LEARNED_LATE = (
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE, MOST, LATE, LEARNED_LATE, TIMELY = (
     713,
     *range(715, 720),
     722,
@@ -73,6 +75,7 @@ RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE
     727,
     729,
     730,
+    731,
 )
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
@@ -259,6 +262,28 @@ PARTS["late_learned"] = Part(
 PARTS |= {
     f"third_more_{size}": Part(
         (THIRD_POLICIES["model"],), EVERYWHERE, (n,), 10000 if n == 8 else 2000, MOST, preset="flight-v3"
+    )
+    for size, n in SIZES.items()
+}
+# Who sends for the sake of time: robots do not keep to what they sent, and the model was trained by
+# `studies.swarm.information`. Its threshold and the rule were chosen on sets 81 and 82
+UNBOUND: dict[str, Any] = {"planner": {"commitment": 0.0}}
+TIMELY_POLICIES = {"none": "none", "full": "full", "rule": "stage:1.2:0.2", "model": "studies/data/worth.zip@0.3"}
+PARTS |= {
+    f"timely_{size}": Part(
+        tuple(TIMELY_POLICIES[who] for who in ("none", "full", "rule")),
+        EVERYWHERE,
+        (n,),
+        500,
+        TIMELY,
+        changes=UNBOUND,
+        preset="flight-v3",
+    )
+    for size, n in SIZES.items()
+}
+PARTS |= {
+    f"timely_model_{size}": Part(
+        (TIMELY_POLICIES["model"],), EVERYWHERE, (n,), 1500, TIMELY, changes=UNBOUND, preset="flight-v3"
     )
     for size, n in SIZES.items()
 }

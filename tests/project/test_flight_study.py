@@ -58,8 +58,9 @@ def test_sets_of_episodes_are_apart():
         version2.MOST,
         version2.LATE,
         version2.LEARNED_LATE,
+        version2.TIMELY,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 31
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 32
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
