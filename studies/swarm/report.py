@@ -56,6 +56,8 @@ from studies.swarm.version2 import (
     STRANGE,
     THIRD,
     THIRD_POLICIES,
+    TIMELY,
+    TIMELY_POLICIES,
     named,
 )
 
@@ -699,8 +701,7 @@ def anticipation_table(rows: Rows) -> str:
                 if policy != "none":
                     parts.append(f"{one['request_share']:.2%}")
                 if full is not None:
-                    later = one["steps_to_arrival"] / full["steps_to_arrival"] - 1
-                    parts.append(f"{later:+.0%}".replace("-0%", "+0%"))
+                    parts.append(later(one, full))
                 texts.append(f"*{who}:*&nbsp;" + "; ".join(parts).replace(" ", "&nbsp;"))
             line.append("<br>".join(texts))
         lines.append(line)
@@ -739,10 +740,41 @@ def late_table(rows: Rows) -> str:
                 if policy not in ("none", FULL):
                     parts.append(f"{one['request_share']:.2%}")
                 if policy != FULL:
-                    parts.append(f"{one['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%"))
+                    parts.append(later(one, full))
                 line.append("; ".join(parts).replace(" ", "&nbsp;"))
             lines.append(line)
     return table(["others are seen", "scenario", *policies], lines)
+
+
+def later(own: dict[str, Any], full: dict[str, Any]) -> str:
+    """Format the time to arrival beside full communication, of flights that arrive."""
+    return f"{own['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%")
+
+
+def timely_table(rows: Rows) -> str:
+    """Format flights of those who send for the sake of time: collisions, plans sent, and arrival beside full
+    communication in the same world.
+
+    :param rows: rows of set 731
+    """
+    cells = {(row["scenario"], row["n_robots"], row["policy"]): row for row in rows}
+    sizes = sorted({row["n_robots"] for row in rows})
+    policies = {"nobody": "none", "rule": TIMELY_POLICIES["rule"], "model": named(TIMELY_POLICIES["model"])}
+    lines = []
+    for name in (*NAMES, *MOST_OBSTACLES):
+        line = [name.replace("_", " ")]
+        for n in sizes:
+            full, texts = cells.get((name, n, FULL)), []
+            for who, policy in policies.items():
+                if full is None or (one := cells.get((name, n, policy))) is None:
+                    continue
+                sent = [] if policy == "none" else [f"{one['request_share']:.1%}"]
+                texts.append(
+                    f"*{who}:* {'; '.join([str(one['collisions']), *sent, later(one, full)])}".replace(" ", "&nbsp;")
+                )
+            line.append("<br>".join(texts))
+        lines.append(line)
+    return table(["scenario", *(f"{n} robots" for n in sizes)], lines)
 
 
 def judged(own: dict[str, Any], full: dict[str, Any]) -> str:
@@ -883,7 +915,8 @@ def main() -> None:
     rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))
     # Those in other disturbances, or with more robots, are no part of the tables
     sealed_2 = [row for row in read_rows(VERSION_2 / "version2.json") if row["set"] != STRANGE]
-    sealed_3 = [row for row in read_rows(VERSION_2 / "version3.json") if row["set"] == THIRD]
+    version_3 = read_rows(VERSION_2 / "version3.json")
+    sealed_3 = [row for row in version_3 if row["set"] == THIRD]
     tried_2 = read_rows(VERSION_2 / "front.json")
     blocks = {
         "targets": targets(test),
@@ -915,7 +948,8 @@ def main() -> None:
         "cells": cells_table(sealed_2),
         "obstacles": obstacles_table(sealed_2),
         "anticipation": anticipation_table(sealed_3),
-        "late": late_table([row for row in read_rows(VERSION_2 / "version3.json") if "changes" in row]),
+        "late": late_table([row for row in version_3 if "sensing" in row.get("changes", {})]),
+        "timely": timely_table([row for row in version_3 if row["set"] == TIMELY]),
         "front": front_table(sealed_2, sealed_3, "docs/planner.md"),
         "front results": front_table(sealed_2, sealed_3, "planner.md"),
         "flight": flight_table(rows["flight"]),

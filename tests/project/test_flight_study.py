@@ -598,3 +598,23 @@ def test_what_is_trained_is_what_flies():
     expected = anticipation.anticipate(seen, *weights, 20, 0.05)
     assert np.allclose(anticipation.outputs(seen, expected[..., 1:, :], 0.05), change, atol=1e-4)
     assert np.abs(change).max() > 0.01
+
+
+def test_who_sends_for_time_is_compared_with_full_communication_in_the_same_world():
+    policies = version2.TIMELY_POLICIES
+    steps = {"none": 103.2, "full": 100.0, policies["rule"]: 99.8, version2.named(policies["model"]): 101.6}
+    rows = [
+        {
+            "policy": policy,
+            "scenario": "forest",
+            "n_robots": n,
+            "collisions": int(policy == "none"),
+            "request_share": 0.0512,
+            "steps_to_arrival": one,
+        }
+        for policy, one in steps.items()
+        for n in (4, 8)
+    ]
+    line = next(line for line in report.timely_table(rows).splitlines() if line.startswith("| forest"))
+    cell = "*nobody:* 1; +3%<br>*rule:* 0; 5.1%; +0%<br>*model:* 0; 5.1%; +2%"
+    assert line.replace("&nbsp;", " ") == f"| forest | {cell} | {cell} |"
