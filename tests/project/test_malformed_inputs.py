@@ -357,10 +357,7 @@ def _no_zip(folder: Path, name: str) -> Path:
 # b. Arguments of the environments
 
 FIELDS = {
-    "reward": (
-        "goal", "collision", "request", "near_miss", "near_miss_distance", "near_miss_width", "near_miss_ahead",
-        "delay", "delay_distance",
-    ),
+    "reward": ("goal", "collision", "request", "near_miss", "near_miss_distance", "near_miss_width", "near_miss_ahead"),
     "planner": (
         "horizon", "dt", "separation", "max_tilt", "max_climb_rate", "max_speed", "workspace_low", "workspace_high",
         "goal_weight", "input_weight", "repulsion_buffer", "violation_weight", "max_neighbours",

@@ -10,13 +10,11 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from quad_swarm.geometry import length
-from quad_swarm.quadrotor import POSITION
 from quad_swarm.task.episode_statistics import EpisodeStatistics
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
 from quad_swarm.task.options import TaskOptions
 from quad_swarm.validation import checked, replaced, with_fields
-from quad_swarm.world.beliefs import of_others, other_indices, reverse_indices
+from quad_swarm.world.beliefs import other_indices, reverse_indices
 from quad_swarm.world.doubts import too_short, warn
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.obstacles import Obstacle
@@ -54,8 +52,6 @@ class RewardConfig:
     near_miss_exponent: Annotated[float, Field(ge=1, le=10)] = 1.0
     near_miss_ahead: Annotated[int, Field(ge=0, le=1000)] = 0
     near_miss_narrowing: NonNegativeFloat = 0.0
-    delay: NonNegativeFloat = 0.0
-    delay_distance: PositiveFloat | None = None
 
 
 class Outcome(NamedTuple):
@@ -63,10 +59,9 @@ class Outcome(NamedTuple):
 
     :param reward: team rewards, (E,)
     :param pair_rewards: the part of a robot's reward that belongs to one of the others, (E, n, n - 1): its request,
-        their collision or near miss, what they delay each other, and equal shares of the goal reward and of the robot's
-        collision with an obstacle
-    :param reward_terms: the weighted terms "goal", "collision" and "requests", and "near_miss" and "delay" if they have
-        a weight, each (E,)
+        their collision or near miss, and equal shares of the goal reward and of the robot's collision with an obstacle
+    :param reward_terms: the weighted terms "goal", "collision" and "requests", and "near_miss" if it has a weight, each
+        (E,)
     :param terminated: whether a collision, or the arrival of all robots, ended the episode, (E,) bool
     :param truncated: whether the time limit ended the episode, (E,) bool
     :param n_requests: number of requests, (E,)
@@ -141,8 +136,6 @@ class RequestTask:
         self.sampler = sampler
         if reward.near_miss_distance is None:
             reward = replace(reward, near_miss_distance=swarm.config.planner.separation)
-        if reward.delay_distance is None:
-            reward = replace(reward, delay_distance=2 * swarm.config.planner.separation)
         self.reward = reward
         self.max_steps = swarm.config.max_steps if max_steps is None else max_steps
         if continuous_collisions is None:
@@ -295,7 +288,6 @@ class RequestTask:
         :param n_requests: number of requests to report, (E,); by default that of ``requests``
         :param announced: which of the plans are sent unasked, as in `Swarm.step`
         """
-        before = self.swarm.state[..., POSITION].copy(), self.swarm.goal.copy()
         report = self.swarm.step(requests, announced)
         collided = report.collision_continuous if self.continuous_collisions else report.collision
         colliding = report.colliding_continuous if self.continuous_collisions else report.colliding
@@ -317,11 +309,6 @@ class RequestTask:
             near_misses = self.reward.near_miss * self._near_misses(report)
             terms["near_miss"] = -np.sum(near_misses, axis=(1, 2)) / 2
             reward = reward + terms["near_miss"]
-        delays = None
-        if self.reward.delay:
-            delays = self.reward.delay * self._delays(report, *before)
-            terms["delay"] = -np.sum(delays, axis=(1, 2)) / 2
-            reward = reward + terms["delay"]
         terminated = collided if self.end_at_collision else np.zeros_like(collided)
         if self.end_at_arrival:
             terminated = terminated | self.statistics.arrived
@@ -335,8 +322,6 @@ class RequestTask:
             pair_rewards = pair_rewards - self.reward.collision * hits / max(requests.shape[2], 1)
         if near_misses is not None:
             pair_rewards -= near_misses
-        if delays is not None:
-            pair_rewards -= delays
         return Outcome(
             reward=reward,
             pair_rewards=pair_rewards.astype(np.float32),
@@ -357,20 +342,6 @@ class RequestTask:
             planned = (limits - self.swarm.planned_separation(ahead, report.others)).max(axis=-1)
             shortfall = np.maximum(shortfall, planned)
         return np.clip(shortfall / reward.near_miss_width, 0.0, 1.0) ** reward.near_miss_exponent
-
-    def _delays(self, report: StepReport, pos: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Return what the robots of each pair lose together (steps), (E, n, n - 1).
-
-        :param pos: positions before the step, (E, n, 3) (m)
-        :param goal: where robots flew in the step, (E, n, 3) (m)
-        """
-        planner = self.swarm.config.planner
-        progress = length(pos - goal) - length(self.swarm.state[..., POSITION] - goal)
-        lost = np.where(report.at_goal, 0.0, 1.0 - progress / (planner.max_speed * planner.dt))
-        planned = self.swarm.planned_separation(planner.horizon - 1, report.others).min(axis=-1)
-        near = planned < self.reward.delay_distance
-        share = lost / np.maximum(near.sum(axis=2), 1)
-        return near * (share[..., None] + of_others(share, np.maximum(report.others, 0)))
 
     def info(self, outcome: Outcome) -> dict[str, Any]:
         """Return the `info` of a step: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""

@@ -247,31 +247,6 @@ def test_near_misses_far_ahead_may_count_from_less_distance():
     assert costs[0.0] > costs[0.1] > costs[0.7] == 0
 
 
-def test_what_robots_lose_on_the_way_counts_for_those_who_are_near():
-    planner = {"max_speed": 2.0, "dt": 0.05}
-    env = QuadSwarmEnv(n_robots=3, world={"planner": planner}, reward={"goal": 0, "request": 0, "delay": 0.5})
-    starts = np.array([[-2.0, 0, 1], [-2.0, 1.0, 1], [-2.0, 4.0, 1]])
-    goals = starts + np.array([4.0, 0, 0])
-    env.reset(options={"starts": starts, "goals": goals})
-    before = env.task.swarm.state[0, :, :3].copy()
-    _, reward, *_, info = env.step(np.zeros(6, np.int8))
-    after = env.task.swarm.state[0, :, :3]
-    progress = np.linalg.norm(before - goals, axis=1) - np.linalg.norm(after - goals, axis=1)
-    lost = 1 - progress / (2.0 * 0.05)
-    expected = np.zeros((3, 2))
-    expected[0, 0] = expected[1, 0] = 0.5 * (lost[0] + lost[1])  # the third is far from both
-    assert lost.min() > 0.5
-    assert -info["pair_rewards"] == pytest.approx(expected, abs=1e-5)
-    assert info["reward_terms"]["delay"] == reward == pytest.approx(-expected.sum() / 2)
-
-
-def test_nobody_loses_at_the_goal():
-    env = QuadSwarmEnv(n_robots=2, reward={"goal": 0, "request": 0, "delay": 1})
-    line = np.array([[-0.5, 0, 1], [0.5, 0, 1]])
-    env.reset(options={"starts": line, "goals": line})
-    assert env.step(np.array([0, 0]))[-1]["reward_terms"]["delay"] == 0
-
-
 def test_episodes_may_end_at_arrival():
     env = QuadSwarmEnv(n_robots=2, end_at_arrival=True)
     line = np.array([[-1.0, 0, 1], [1, 0, 1]])
@@ -283,6 +258,4 @@ def test_episodes_may_end_at_arrival():
 def test_near_misses_begin_at_what_the_planner_keeps_unless_said():
     for world, distance in (({}, 0.6), ({"planner": {"separation": 0.8}}, 0.8), ({"radius": 0.1}, 0.2)):
         assert make_task(reward={"near_miss": 1}, world=world).reward.near_miss_distance == pytest.approx(distance)
-        assert make_task(world=world).reward.delay_distance == pytest.approx(2 * distance)
     assert make_task(reward={"near_miss": 1, "near_miss_distance": 0.7}).reward.near_miss_distance == 0.7
-    assert make_task(reward={"delay_distance": 1.0}).reward.delay_distance == 1.0
