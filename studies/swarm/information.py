@@ -181,7 +181,7 @@ def train(options: argparse.Namespace) -> MADDPG:
             obs, asked = (th.as_tensor(part) for part in known[school.rng.integers(len(known))])
             chosen = th.randperm(len(obs))[:24]
             logits = model.actor.logits(obs[chosen])
-            may = th.isfinite(logits) & (logits > -50)
+            may = logits > -50.0  # what the action mask allows
             loss = F.binary_cross_entropy_with_logits(logits[may], asked[chosen][may].float())
             optimizer.zero_grad()
             loss.backward()
@@ -201,9 +201,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="where to write the model")
     parser.add_argument("--preset", default="flight-v3", help="the world (default %(default)s)")
     parser.add_argument("--n-robots", type=int, default=12, help="number of robots (default %(default)s)")
-    parser.add_argument("--rounds", type=int, default=4, help="rounds of flying and learning (default %(default)s)")
+    parser.add_argument("--rounds", type=int, default=6, help="rounds of flying and learning (default %(default)s)")
     parser.add_argument("--lessons", type=int, default=60, help="looks in each round (default %(default)s)")
-    parser.add_argument("--updates", type=int, default=1500, help="updates in each round (default %(default)s)")
+    parser.add_argument("--updates", type=int, default=2000, help="updates in each round (default %(default)s)")
     parser.add_argument("--target", default="change:0.2", help="which plans are worth knowing (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of episodes and actor (default %(default)s)")
     options = parser.parse_args()

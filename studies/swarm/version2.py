@@ -332,7 +332,7 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
             for policy, rows in flown.items():
                 keys: dict[str, Any] = {"policy": named(policy), "scenario": scenario, "n_robots": n}
                 keys["plant"] = part.plant
-                if part.set in (LATE, LEARNED_LATE):
+                if part.set in (LATE, LEARNED_LATE, TIMELY):
                     keys["changes"] = part.changes
                 yield (
                     keys
