@@ -9,7 +9,6 @@ from itertools import chain, pairwise
 import torch as th
 from torch import nn
 
-
 FEW = 16  # observations, from which on the batch is the last axis
 
 
