@@ -207,6 +207,11 @@ def main() -> None:
     parser.add_argument("--target", default="change:0.2", help="which plans are worth knowing (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of episodes and actor (default %(default)s)")
     options = parser.parse_args()
+    try:
+        parse_rule(options.target)
+    except ValueError as error:
+        parser.error(str(error))
+    options.out.parent.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     train(options).save(options.out, lean="actor")
     print(f"{options.out}: {time.perf_counter() - started:.0f} s")
