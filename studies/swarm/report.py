@@ -10,7 +10,7 @@ import argparse
 import itertools
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -680,15 +680,17 @@ def front_table(second: Rows, third: Rows, page: str) -> str:
     return table(["how they avoid each other", "who sends", "eight robots", "sixteen robots"], lines)
 
 
-def anticipation_table(rows: Rows) -> str:
+def anticipation_table(rows: Rows, flown: Mapping[str, str] = THIRD_POLICIES, marked: bool = True) -> str:
     """Format the flights in `flight-v3` by scenario and number of robots: who collides if nobody sends anything, by a
-    rule, and with the packaged model of version 2. Without flights of full communication, they are not compared.
+    rule, and with a model. Without flights of full communication, they are not compared.
 
     :param rows: rows of `studies.swarm.version2` in that preset
+    :param flown: the policies "none", "rule" and "model"
+    :param marked: whether to mark who is not within the margin of full communication
     """
     cells = {(row["scenario"], row["n_robots"], row["policy"]): row for row in rows}
     sizes = sorted({row["n_robots"] for row in rows})
-    policies = {"nobody": "none", "rule": THIRD_POLICIES["rule"], "model": named(THIRD_POLICIES["model"])}
+    policies = {"nobody": flown["none"], "rule": flown["rule"], "model": named(flown["model"])}
     lines = []
     for name in (*NAMES, *MOST_OBSTACLES):
         line = [name.replace("_", " ")]
@@ -697,7 +699,7 @@ def anticipation_table(rows: Rows) -> str:
             for who, policy in policies.items():
                 if (one := cells.get((name, n, policy))) is None:
                     continue
-                parts = [str(one["collisions"]) if full is None else judged(one, full)]
+                parts = [judged(one, full) if full is not None and marked else str(one["collisions"])]
                 if policy != "none":
                     parts.append(f"{one['request_share']:.2%}")
                 if full is not None:
@@ -749,32 +751,6 @@ def late_table(rows: Rows) -> str:
 def later(own: dict[str, Any], full: dict[str, Any]) -> str:
     """Format the time to arrival beside full communication, of flights that arrive."""
     return f"{own['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%")
-
-
-def timely_table(rows: Rows) -> str:
-    """Format flights of those who send for the sake of time: collisions, plans sent, and arrival beside full
-    communication in the same world.
-
-    :param rows: rows of set 731
-    """
-    cells = {(row["scenario"], row["n_robots"], row["policy"]): row for row in rows}
-    sizes = sorted({row["n_robots"] for row in rows})
-    policies = {"nobody": "none", "rule": TIMELY_POLICIES["rule"], "model": named(TIMELY_POLICIES["model"])}
-    lines = []
-    for name in (*NAMES, *MOST_OBSTACLES):
-        line = [name.replace("_", " ")]
-        for n in sizes:
-            full, texts = cells.get((name, n, FULL)), []
-            for who, policy in policies.items():
-                if full is None or (one := cells.get((name, n, policy))) is None:
-                    continue
-                sent = [] if policy == "none" else [f"{one['request_share']:.1%}"]
-                texts.append(
-                    f"*{who}:* {'; '.join([str(one['collisions']), *sent, later(one, full)])}".replace(" ", "&nbsp;")
-                )
-            line.append("<br>".join(texts))
-        lines.append(line)
-    return table(["scenario", *(f"{n} robots" for n in sizes)], lines)
 
 
 def judged(own: dict[str, Any], full: dict[str, Any]) -> str:
@@ -949,7 +925,7 @@ def main() -> None:
         "obstacles": obstacles_table(sealed_2),
         "anticipation": anticipation_table(sealed_3),
         "late": late_table([row for row in version_3 if "sensing" in row.get("changes", {})]),
-        "timely": timely_table([row for row in version_3 if row["set"] == TIMELY]),
+        "timely": anticipation_table([row for row in version_3 if row["set"] == TIMELY], TIMELY_POLICIES, marked=False),
         "front": front_table(sealed_2, sealed_3, "docs/planner.md"),
         "front results": front_table(sealed_2, sealed_3, "planner.md"),
         "flight": flight_table(rows["flight"]),
