@@ -86,7 +86,7 @@ results: install  ## fly everything that docs/results.md says again: tuned rules
 results-quick: install  ## the same with few episodes and rules, into $(LOGS)/results
 	$(STUDY).tune_rules --quick --jobs $(JOBS) --json $(LOGS)/results/rules.json.gz
 	$(STUDY).fly $(QUICK_PARTS) --quick --jobs $(JOBS) --out $(LOGS)/results
-	$(STUDY).ppo --steps 4096 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/ppo.json.gz
+	$(STUDY).ppo --steps 8192 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/ppo.json.gz
 	$(STUDY).counterfactual --forks 10 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/counterfactual.json.gz
 	$(STUDY).report --data $(LOGS)/results --pages $(LOGS)/results --images $(LOGS)/results
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from typing import NamedTuple
 
-import gymnasium
 import numpy as np
 import torch as th
 from torch.nn import functional as F
@@ -21,7 +20,7 @@ from torch.nn import functional as F
 from quad_swarm.task.request_task import RequestTask, make_task
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG
-from studies.swarm.experiment import Experiment, Row
+from studies.swarm.experiment import Experiment, Row, untrained
 from studies.swarm.ppo import env_kwargs, reference_arguments, validate
 
 PRICES = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
@@ -110,11 +109,7 @@ class Forks:
 
 def train(forks: int, seed: int) -> tuple[MADDPG, Forks]:
     """Train the actor by regression on forks, whose states come from its own flights."""
-    env = gymnasium.make("QuadSwarm-v0", **env_kwargs(0.0))
-    policy_kwargs = {"net_arch": [64, 64], "pair_credit": True}
-    model = MADDPG(
-        "PairPolicy", env, policy_kwargs=policy_kwargs, buffer_size=1000, batch_size=1000, seed=seed, device="cpu"
-    )
+    model = untrained(env_kwargs(0.0), {"net_arch": [64, 64], "pair_credit": True}, seed)
     source, n_robots = Forks(model, seed), make_config("paper").n_robots
     known: list[Labels] = []
     optimizer = th.optim.Adam(model.actor.parameters(), lr=1e-3)

@@ -17,6 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import gymnasium
 import numpy as np
 from tqdm import tqdm
 
@@ -30,6 +31,7 @@ from quad_swarm.task.request_task import RequestTask, RewardConfig
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
+from sb3_maddpg import MADDPG
 
 Item = TypeVar("Item")
 Row = dict[str, Any]
@@ -38,9 +40,22 @@ Row = dict[str, Any]
 LINGER = 10
 
 
-def condition(policy: str, scenario: str, config: SwarmConfig, algo: str = "sb3_maddpg:MADDPG") -> Condition:
+def condition(policy: str, scenario: str, config: SwarmConfig) -> Condition:
     """Return a policy in a scenario with the settings of all results of the study."""
-    return Condition(policy, scenario, config, algo=algo, solver="rti", linger=LINGER)
+    return Condition(policy, scenario, config, solver="rti", linger=LINGER)
+
+
+def untrained(kwargs: Mapping[str, Any], policy_kwargs: Mapping[str, Any], seed: int) -> MADDPG:
+    """Return a model whose actor something other than MADDPG trains.
+
+    :param kwargs: arguments of the environment
+    :param policy_kwargs: see `PairPolicy`
+    :param seed: seed of the networks
+    """
+    env = gymnasium.make("QuadSwarm-v0", **kwargs)
+    return MADDPG(
+        "PairPolicy", env, policy_kwargs=dict(policy_kwargs), buffer_size=1000, batch_size=1000, seed=seed, device="cpu"
+    )
 
 
 def fly_kept(conditions: Sequence[Condition], episodes: int, seed: int, skip: int = 0) -> dict[Condition, Rows]:
@@ -77,7 +92,6 @@ class Job(NamedTuple):
     :param config: the world
     :param episodes: number of episodes
     :param seed: index of the set of episodes
-    :param algo: ``module:Class`` that loads models
     """
 
     keys: Row
@@ -86,16 +100,13 @@ class Job(NamedTuple):
     config: SwarmConfig
     episodes: int = 0
     seed: int = 0
-    algo: str = "sb3_maddpg:MADDPG"
 
     def fly(self, linger: int | None = LINGER) -> dict[str, Rows]:
         """Return the statistics of each policy's episodes.
 
         :param linger: number of steps to fly after arrival, None for whole episodes
         """
-        conditions = [
-            replace(condition(policy, self.scenario, self.config, self.algo), linger=linger) for policy in self.policies
-        ]
+        conditions = [replace(condition(policy, self.scenario, self.config), linger=linger) for policy in self.policies]
         return {one.policy: rows for one, rows in fly_kept(conditions, self.episodes, self.seed).items()}
 
     def row(self, policy: str, rows: Rows) -> Row:

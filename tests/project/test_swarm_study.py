@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from quad_swarm.evaluation.evaluation import fly_all
+from quad_swarm.evaluation.flight import first_episode, run_episodes
 from quad_swarm.evaluation.inference import Comparison
 from quad_swarm.evaluation.rows import read_rows, write_rows
 from quad_swarm.task.rules import parse_rule
@@ -272,7 +273,7 @@ def test_a_threshold_needs_a_reserve():
 @pytest.mark.slow
 def test_ppo_is_trained_and_flown(tmp_path, monkeypatch):
     table = tmp_path / "ppo.json"
-    words = ["ppo.py", "--price", "0.05", "--steps", "2048", "--episodes", "3", "--models", str(tmp_path)]
+    words = ["ppo.py", "--price", "0.05", "--steps", "8192", "--episodes", "3", "--models", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", [*words, "--json", str(table)])
     ppo.main()
     rows = read_rows(table)
@@ -281,6 +282,22 @@ def test_ppo_is_trained_and_flown(tmp_path, monkeypatch):
     assert shares == sorted(shares, reverse=True)
     assert shares[0] > shares[-1]
     assert page.reference_table(rows, "price", "threshold").count("/3, ") == len(rows)
+
+
+@pytest.mark.slow
+def test_what_ppo_trains_in_version_2_flies_with_any_number_of_robots(tmp_path, monkeypatch):
+    monkeypatch.setattr(ppo, "TEAMS", 8)
+    untrained = ppo.train("flight_v2", 0.2, 0, 0).policy.state_dict()
+    words = ["ppo.py", "--recipe", "flight_v2", "--price", "0.2", "--steps", "1024", "--models", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
+    ppo.main()
+    path = tmp_path / "ppo_flight_v2_price0.2_seed0.zip"
+    trained = MADDPG.load(path).policy.state_dict()
+    changed = [name for name, weight in trained.items() if "actor.net" in name and not weight.equal(untrained[name])]
+    assert len(changed) >= 8, "PPO has trained MADDPG's actor"
+    config = make_config("flight-v2", n_robots=5)
+    rows = run_episodes(condition(f"{path}@0.4", "random_swap", config), [first_episode(1)])
+    assert 0 < rows[0]["requests"] / rows[0]["possible_requests"] < 1
 
 
 @pytest.mark.slow
