@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +15,29 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, PercentFormatter
 
-from quad_swarm.evaluation.flight import Flight, begin, first_episode, fly
+from quad_swarm.evaluation.flight import Flight, begin, first_episode, fly, fly_steps
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import is_model
-from quad_swarm.figures.colours import COLOURS, INK, LEARNED, RULES, STYLE
+from quad_swarm.figures.colours import COLOURS, INK, LEARNED, RULES, STYLE, colour_of
 from quad_swarm.figures.plots import draw_flight, explain_flights
 from quad_swarm.plants.base import MODEL
+from quad_swarm.task.request_task import RequestTask, requests_of
+from quad_swarm.task.view import View
+from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import without_obstacles
 from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import condition, progress
 from studies.swarm.protocol import EARLIER
-from studies.swarm.version2 import BOLDER, CHEAP_RULES, ORCA, named
+from studies.swarm.version2 import BOLDER, CHEAP_RULES, EVERYWHERE, ORCA, THIRD_POLICIES, named
 
 NAMES = without_obstacles()[::-1]  # the hardest first
 WORLDS = {"paper": "Four robots (paper)", "dense": "Eight robots (dense)"}
 Rows = list[dict[str, Any]]
+# The set whose flights show what is sent, and the bounds (m) by which they are counted: how wrong the receiver is, and
+# how close the plan passes it
+LOOKED_AT = 84
+WRONG, CLOSE = (0.0, 0.1, 0.2, 0.4, 0.6, np.inf), (0.0, 0.8, 1.0, 1.5, np.inf)
 
 
 def rate_of(row: dict[str, Any]) -> float:
@@ -330,6 +339,91 @@ def draw_expectations(path: Path) -> None:
     handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     figure.axes[0].set_ylabel("y (m)")
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=3)
+    figure.savefig(path)
+
+
+def _sent(scenario: str, episodes: int) -> tuple[np.ndarray, ...]:
+    """Fly episodes of eight robots with the packaged model of `flight-v3`, and look at each pair in each step.
+
+    :return: how wrong the other is about the robot's plan within the next second (m), how close that plan passes it by
+        what the robot expects of it (m), and whether the plan is sent to it, (pairs,) each
+    """
+    policy, task, rngs = begin(
+        condition(THIRD_POLICIES["model"], scenario, make_config("flight-v3", n_robots=8)),
+        [first_episode(LOOKED_AT) + k for k in range(episodes)],
+    )
+    seen: list[tuple[np.ndarray, ...]] = []
+
+    def looking(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
+        bits, view, neighbours = policy(task, rngs), View(task.swarm), task.swarm.neighbours
+        believed = view.seen_by_others(range(view.horizon)).believed
+        wrong = np.linalg.norm(view.absolute_plans[:, :, None, 1:] - believed, axis=-1).max(axis=-1)
+        sent = neighbours.of_the_other(requests_of(task.sent(bits), neighbours))
+        seen.append(tuple(each.ravel() for each in (wrong, view.plan_approach.least, sent)))
+        return bits
+
+    for _ in fly_steps(looking, task, rngs, linger=0):
+        pass
+    return tuple(np.concatenate(part) for part in zip(*seen, strict=True))
+
+
+def _draw_sent(axes: Axes, flight: Flight) -> int:
+    """Draw a flight from above, with an arrow for each plan that is sent, from where its sender is to its receiver.
+
+    :return: number of plans
+    """
+    nobody = np.zeros_like(flight.requests)
+    draw_flight(axes, replace(flight, requests=nobody, announced=nobody))
+    for line in axes.lines:
+        line.set_alpha(0.45)
+    others, plans = other_indices(flight.n_robots), np.argwhere(flight.requests[: flight.arrival])
+    for number, (step, receiver, k) in enumerate(plans, 1):
+        sender = others[receiver, k]
+        here, there = (tuple(flight.pos[step, one, :2]) for one in (sender, receiver))
+        arrow = {"arrowstyle": "-|>", "color": colour_of(sender), "linewidth": 1.4, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", there, here, arrowprops=arrow, zorder=4)
+        axes.plot(*here, "o", color=colour_of(sender), markeredgecolor=INK, markersize=10, zorder=5)
+        axes.annotate(str(number), here, ha="center", va="center", fontsize=7, color="white", zorder=6)
+    return len(plans)
+
+
+@rc_context(STYLE)
+def draw_telling(path: Path) -> None:
+    """Draw what the packaged model of `flight-v3` sends: the plans of two flights, and how often it sends one by how
+    wrong the other is and how close the two will pass."""
+    config = make_config("flight-v3", n_robots=8)
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    panels = figure.subplots(1, 3, width_ratios=[1, 1, 1.2])
+    for axes, name in zip(panels, ("forest", "crossing_traffic"), strict=False):
+        flight = fly(condition(THIRD_POLICIES["model"], name, config), LOOKED_AT)
+        possible = (flight.arrival or len(flight.requests)) * 8 * 7
+        axes.set_title(f"{name.replace('_', ' ')}: {_draw_sent(axes, flight)} of {possible:,} plans")
+    wrong, close, sent = (np.concatenate(part) for part in zip(*(_sent(name, 40) for name in EVERYWHERE), strict=True))
+    axes, shares = panels[2], np.zeros((len(CLOSE) - 1, len(WRONG) - 1))
+    for (row, (low, high)), (column, (least, most)) in itertools.product(
+        enumerate(pairwise(CLOSE)), enumerate(pairwise(WRONG))
+    ):
+        inside = (close >= low) & (close < high) & (wrong >= least) & (wrong < most)
+        shares[row, column] = sent[inside].mean()
+        colour = "white" if shares[row, column] > 0.03 else INK
+        axes.text(column, row, f"{shares[row, column]:.2%}", ha="center", va="center", color=colour, fontsize=8)
+    axes.imshow(np.log10(np.maximum(shares, 1e-4)), cmap="Oranges", vmax=0, origin="lower", aspect="auto")
+    for axis, bounds in ((axes.xaxis, WRONG), (axes.yaxis, CLOSE)):
+        inner = [f"{low:g} to {high:g}" for low, high in pairwise(bounds[1:-1])]
+        axis.set_ticks(range(len(bounds) - 1), [f"< {bounds[1]:g}", *inner, f"> {bounds[-2]:g}"])
+    axes.set(
+        xlabel="error of what the other expects of it (m)",
+        ylabel="how close the robot's plan passes the other (m)",
+        title="share of plans sent, 280 flights",
+    )
+    axes.grid(visible=False)
+    marks: dict[str, dict[str, Any]] = {
+        "start": {"marker": "o", "markersize": 7, "markerfacecolor": "white"},
+        "goal": {"marker": "*", "markersize": 10},
+        "a plan, from its sender to its receiver, in order": {"marker": r"$1\to$", "markersize": 16},
+    }
+    handles = [axes.plot([], [], linestyle="", color=RULES, label=name, **style)[0] for name, style in marks.items()]
+    figure.legend(handles=handles, loc="outside lower left", ncols=len(handles))
     figure.savefig(path)
 
 

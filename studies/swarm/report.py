@@ -34,6 +34,7 @@ from studies.swarm.figures import (
     draw_expectations,
     draw_flight_fronts,
     draw_fronts,
+    draw_telling,
     draw_trajectories,
     draw_version_2,
     flights,
@@ -961,6 +962,7 @@ def main() -> None:
         draw_flight_fronts(tried, *sealed, args.images / "front_flight.png")
     draw_version_2(sealed_2, tried_2, args.images / "front_version_2.png")
     draw_expectations(args.images / "expectations.png")
+    draw_telling(args.images / "telling.png")
     if flown:
         draw_trajectories(flown, args.images / "flights.png")
     if asking:
