@@ -5,9 +5,10 @@ could follow, since they know all plans. Robots receive the plan of another if t
 ``EPS`` (m) at some stage (``change:EPS``), or if theirs, made without it, costs more beside that plan than the one that
 they would make with it by ``COST`` (``regret:COST``).
 
-``python -m studies.swarm.information train --out F.zip [--target RULE] [--rounds N] [--n-robots N] [--seed S]`` trains
-the actor of zoo_configs/quad_swarm_flight_v2.yml to know, by logistic regression, which plans such a rule would send.
-Robots fly as the last actor sends, at first as a rule that tells, so that it learns from its own flights.
+``python -m studies.swarm.information train --out F.zip [--target RULE] [--rounds N] [--n-robots N] [--seed S]
+[--preset P] [--world NAME=VALUE ...]`` trains the actor of zoo_configs/quad_swarm_flight_v2.yml to know, by logistic
+regression, which plans such a rule would send. Robots fly as the last actor sends, at first as a rule that tells, so
+that it learns from its own flights.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ import argparse
 import functools
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 import torch as th
 import yaml
@@ -32,10 +33,12 @@ from quad_swarm.quadrotor import POSITION
 from quad_swarm.task.request_task import RequestTask, make_task
 from quad_swarm.task.rules import RULES, Rule, parse_rule
 from quad_swarm.task.view import View
+from quad_swarm.validation import read_assignments
 from quad_swarm.world.swarm import Swarm
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.main import main as command
 from studies.learning import ROOT
+from studies.swarm.experiment import untrained
 
 RECIPE = "zoo_configs/quad_swarm_flight_v2.yml"
 # Distance between a plan and another's beyond which neither changes (m)
@@ -108,6 +111,11 @@ def by_change(distance: float) -> Rule:
     return lambda view: worth(view).change > distance
 
 
+def add_rules() -> None:
+    """Register both rules."""
+    RULES["regret"], RULES["change"] = (by_regret, ("COST",)), (by_change, ("EPS",))
+
+
 class Lesson(NamedTuple):
     """What robots saw, and what was worth knowing.
 
@@ -122,6 +130,9 @@ class Lesson(NamedTuple):
 class School:
     """Swarms that fly as a rule or an actor sends, and whose robots plan again now and then.
 
+    :ivar seen: observations of the last steps before the newest, oldest first
+    :ivar age: number of steps since the episodes began, (E,)
+
     :param kwargs: arguments of the environment
     :param target: the rule by which plans are worth knowing, such as "change:0.2"
     :param seed: seed of the episodes
@@ -131,10 +142,13 @@ class School:
         self.rng, self.target = np.random.default_rng(seed), parse_rule(target)
         self.task: RequestTask = make_task(SWARMS, **kwargs)
         self.rule = parse_rule("stage:1.2:0.2")
+        self.seen: deque[np.ndarray] = deque(maxlen=APART)
+        self.age = np.zeros(SWARMS, dtype=np.int64)
         for swarm in range(SWARMS):
             self._begin(swarm)
 
     def _begin(self, swarm: int) -> None:
+        self.age[swarm] = 0
         self.task.reset(swarm, np.random.default_rng(int(self.rng.integers(2**31))))
 
     def _bits(self, model: MADDPG | None, obs: np.ndarray) -> np.ndarray:
@@ -151,7 +165,9 @@ class School:
         """Fly some steps, then look."""
         for _ in range(APART):
             obs = self.task.observe()
+            self.seen.append(obs)
             outcome = self.task.act(self._bits(model, obs))
+            self.age += 1
             for swarm in np.flatnonzero(outcome.terminated | outcome.truncated):
                 self._begin(int(swarm))
         matters = self.target(View(self.task.swarm))
@@ -160,15 +176,18 @@ class School:
         return Lesson(self.task.observe(), asked.reshape(*asked.shape[:2], -1))
 
 
-def train(options: argparse.Namespace) -> MADDPG:
-    """Train an actor. Prints what it has learned after each round."""
+def beginner(options: argparse.Namespace) -> tuple[MADDPG, dict[str, Any]]:
+    """Return a model whose actor has not learned, and the arguments of its environment."""
     recipe = yaml.safe_load((ROOT / RECIPE).read_text())["QuadSwarm-v0"]
     observed = recipe["env_kwargs"]["observation"].removesuffix("+critic")
     kwargs = {**recipe["env_kwargs"], "preset": options.preset, "n_robots": options.n_robots, "observation": observed}
-    kwargs |= {"world": {"planner": {"commitment": 0.0}}, "reward": {"goal": 0, "request": 0}}
-    env = gymnasium.make("QuadSwarm-v0", **kwargs)
-    arguments = {"buffer_size": 1000, "batch_size": 1000, "seed": options.seed, "device": "cpu"}
-    model = MADDPG("PairPolicy", env, policy_kwargs=recipe["policy_kwargs"], **arguments)
+    kwargs |= {"world": read_assignments("--world", options.world), "reward": {"goal": 0, "request": 0}}
+    return untrained(kwargs, recipe["policy_kwargs"], options.seed), kwargs
+
+
+def train(options: argparse.Namespace) -> MADDPG:
+    """Train an actor. Prints what it has learned after each round."""
+    model, kwargs = beginner(options)
     school = School(kwargs, options.target, options.seed)
     optimizer = th.optim.Adam(model.actor.parameters(), lr=1e-3)
     known: list[Lesson] = []
@@ -191,26 +210,43 @@ def train(options: argparse.Namespace) -> MADDPG:
     return model
 
 
-def main() -> None:
-    """Run the command line."""
-    RULES["regret"], RULES["change"] = (by_regret, ("COST",)), (by_change, ("EPS",))
-    if sys.argv[1:2] == ["evaluate"]:
-        sys.exit(command())
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("train", choices=["train"])
-    parser.add_argument("--out", type=Path, required=True, help="where to write the model")
+def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Read the command line, with the options of those who learn what plans are worth.
+
+    :param parser: the command's other options
+    """
     parser.add_argument("--preset", default="flight-v3", help="the world (default %(default)s)")
+    parser.add_argument(
+        "--world",
+        nargs="*",
+        default=["planner.commitment=0"],
+        metavar="NAME=VALUE",
+        help="fields of the world (default planner.commitment=0)",
+    )
     parser.add_argument("--n-robots", type=int, default=12, help="number of robots (default %(default)s)")
-    parser.add_argument("--rounds", type=int, default=6, help="rounds of flying and learning (default %(default)s)")
-    parser.add_argument("--lessons", type=int, default=60, help="looks in each round (default %(default)s)")
-    parser.add_argument("--updates", type=int, default=2000, help="updates in each round (default %(default)s)")
     parser.add_argument("--target", default="change:0.2", help="which plans are worth knowing (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of episodes and actor (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of episodes and networks (default %(default)s)")
+    add_rules()
     options = parser.parse_args()
     try:
         parse_rule(options.target)
     except ValueError as error:
         parser.error(str(error))
+    return options
+
+
+def main() -> None:
+    """Run the command line."""
+    if sys.argv[1:2] == ["evaluate"]:
+        add_rules()
+        sys.exit(command())
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("train", choices=["train"])
+    parser.add_argument("--out", type=Path, required=True, help="where to write the model")
+    parser.add_argument("--rounds", type=int, default=6, help="rounds of flying and learning (default %(default)s)")
+    parser.add_argument("--lessons", type=int, default=60, help="looks in each round (default %(default)s)")
+    parser.add_argument("--updates", type=int, default=2000, help="updates in each round (default %(default)s)")
+    options = parsed(parser)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     train(options).save(options.out, lean="actor")

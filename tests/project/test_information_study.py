@@ -10,7 +10,7 @@ from quad_swarm.task.request_task import make_task
 from quad_swarm.task.rules import RULES
 from quad_swarm.task.view import View
 from sb3_maddpg import MADDPG
-from studies.swarm import information
+from studies.swarm import history, information
 
 HEAD_ON = np.array([[-1.5, 0.05, 1.0], [1.5, -0.05, 1.0]])
 
@@ -83,3 +83,38 @@ def test_an_actor_learns_what_is_worth_knowing_and_flies(tmp_path, monkeypatch):
     shares = {row["policy"]: row["request_share"] for row in read_rows(table)}
     assert shares.pop("none") == 0
     assert 0 < shares["change:0.2"] < 0.2
+
+
+def test_frames_are_of_the_same_episode(monkeypatch):
+    monkeypatch.setattr(information, "SWARMS", 2)
+    kwargs = {"preset": "flight-v2", "n_robots": 3, "observation": "state+memory+mask", "announcements": True}
+    school = information.School({**kwargs, "max_steps": 6}, "stage:1.2:0.2", 0)
+    seen = []
+    observe = school.task.observe
+    school.task.observe = lambda: seen.append((school.age.copy(), observe())) or seen[-1][1]
+    for _ in range(4):
+        frames = history.film(school).frames
+        ages, obs = seen[-1]
+        for swarm, age in enumerate(ages):
+            for k, frame in enumerate(frames[:, swarm]):
+                then = seen[-1 - min(k, age)][1][swarm]
+                assert np.array_equal(frame, then), f"{k} steps ago, {age} steps after the episode began"
+        assert np.array_equal(frames[0], obs)
+
+
+def test_average_precision_is_one_if_all_that_matters_comes_first():
+    matters = np.array([True, False, True, False])
+    assert history.precision_of(np.array([4.0, 1.0, 3.0, 2.0]), matters) == 1.0
+    assert history.precision_of(np.array([1.0, 4.0, 2.0, 3.0]), matters) == pytest.approx((1 / 3 + 2 / 4) / 2)
+
+
+@pytest.mark.slow
+def test_a_network_learns_from_what_robots_remember(tmp_path, monkeypatch, capsys):
+    table = tmp_path / "history.json"
+    words = ["history", "--lessons", "12", "--updates", "60", "--n-robots", "6", "--frames", "1", "5"]
+    monkeypatch.setattr(sys, "argv", [*words, "--json", str(table)])
+    history.main()
+    rows = read_rows(table)
+    assert [row["frames"] for row in rows] == [1, 5]
+    assert len({(row["pairs"], row["matter"]) for row in rows}) == 1, "of the same flights"
+    assert all(row["matter"] < row["average_precision"] < 1 for row in rows)
