@@ -35,11 +35,12 @@ sends; set 727 ``third_more_SIZE``, the packaged model as in set 722, for 12,000
 other numbers in all. Set 729 is ``late_1``, ``late_2``, ``late_4`` and ``lost``, eight robots in `flight-v3` that
 observe others 50, 100 or 200 ms late, or lose them from sight for a tenth of the time; set 730 ``late_learned``, 200 ms
 late with a network that learned so. Set 731 is ``timely_SIZE`` and ``timely_model_SIZE``, all scenarios in `flight-v3`
-without commitment: nobody, everybody, a rule that tells much, and a model that knows which plans change others. Set 720
-(``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before robots of version 3 kept right of predicted
-others; set 721 never flew. All parts before set 706 fly with equal penalties, those before set 709 without the reserve,
-as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written after each
-row, so that a run that is ended keeps what it has.
+without commitment: nobody, everybody, a rule that tells much, and a model that knows which plans change others. Set 732
+is ``peers_SIZE`` and ``third_peers_SIZE``, all scenarios in `flight-v2` and `flight-v3`: PPO and imitation with the
+networks and observations of the packaged model. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at
+2fd9813, before robots of version 3 kept right of predicted others; set 721 never flew. All parts before set 706 fly
+with equal penalties, those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and
+number of robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import models, world
 
 SEALED, LATER, LAST, MORE, AGAIN, ONE, AMONG, TRAINED, SEEDS, BRAKING, FIVE = range(700, 711)
-RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE, MOST, LATE, LEARNED_LATE, TIMELY = (
+RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE, MOST = (
     713,
     *range(715, 720),
     722,
@@ -73,10 +74,8 @@ RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE
     724,
     726,
     727,
-    729,
-    730,
-    731,
 )
+LATE, LEARNED_LATE, TIMELY, PEERS = range(729, 733)
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -284,6 +283,19 @@ PARTS |= {
 PARTS |= {
     f"timely_model_{size}": Part(
         (TIMELY_POLICIES["model"],), EVERYWHERE, (n,), 1500, TIMELY, changes=UNBOUND, preset="flight-v3"
+    )
+    for size, n in SIZES.items()
+}
+# Other ways to learn, with the networks, observations and rewards of the packaged model: Stable-Baselines3's PPO, and
+# imitation of who knows which plans change others (`studies.swarm.ppo`, `studies.swarm.information`). Prices and
+# thresholds were chosen on set 83, in which both send about as much as the packaged model does at its threshold
+PPO_2, PPO_3 = (f"studies/swarm/data/ppo_flight_v2_price{price}_seed0.zip@0.5" for price in (0.05, 0.2))
+IMITATION_2, IMITATION_3 = (f"studies/data/imitation.zip@{threshold}" for threshold in (0.5, 0.8))
+PARTS |= {
+    f"{what}_{size}": Part(policies, EVERYWHERE, (n,), 1000 if n == 8 else 500, PEERS, preset=preset)
+    for what, policies, preset in (
+        ("peers", (PPO_2, IMITATION_2), "flight-v2"),
+        ("third_peers", (PPO_3, IMITATION_3), "flight-v3"),
     )
     for size, n in SIZES.items()
 }
