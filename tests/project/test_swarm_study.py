@@ -19,7 +19,19 @@ from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
 from sb3_maddpg.hub.pretrained import pretrained_folder
-from studies.swarm import checkpoints, counterfactual, fly, ppo, protocol, requests, tune_rules, tune_thresholds, unseen
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
+from studies.swarm import (
+    checkpoints,
+    counterfactual,
+    dual,
+    fly,
+    ppo,
+    protocol,
+    requests,
+    tune_rules,
+    tune_thresholds,
+    unseen,
+)
 from studies.swarm import report as page
 from studies.swarm.experiment import Experiment, Job, condition, known_rows
 
@@ -391,3 +403,16 @@ def test_hero_is_an_animation_in_two_themes(tmp_path):
     assert first["light", "webp"].mean() > 160
     assert first["dark", "webp"].mean() < 80
     assert np.abs(first["dark", "webp"] - first["dark", "gif"]).mean() < 10
+
+
+@pytest.mark.slow
+def test_the_price_rises_while_fewer_collide_than_tolerated_and_falls_otherwise():
+    prices = {}
+    for rate in (0.0, 1.0):
+        deaf = {"preset": "flight-v2", "observation": "state", "world": {"radio": {"loss": 1.0}}}
+        env = GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", 8, scenario="symmetric_swap", **deaf))
+        model = MADDPG("PairPolicy", env, learning_starts=1000, buffer_size=1000, batch_size=100, seed=0, device="cpu")
+        model.learn(900, callback=dual.TolerateCollisions(rate, price=0.1))
+        prices[rate] = model.threshold_price
+    assert prices[0.0] == pytest.approx((dual.LOWEST / dual.WIDTH, dual.LOWEST * dual.WIDTH)), "most collide"
+    assert prices[1.0][0] > 0.1 / dual.WIDTH
