@@ -50,10 +50,17 @@ from studies.swarm.version2 import (
     BRAKING,
     CHEAP_RULES,
     ELSEWHERE,
+    IMITATION_2,
+    IMITATION_3,
     LOWER,
     MASK_ONLY,
+    MOST,
     ORCA,
     OWN_MODEL,
+    PEERS,
+    PPO_2,
+    PPO_3,
+    SIZES,
     STRANGE,
     THIRD,
     THIRD_POLICIES,
@@ -711,6 +718,48 @@ def anticipation_table(rows: Rows, flown: Mapping[str, str] = THIRD_POLICIES, ma
     return table(["scenario", *(f"{n} robots" for n in sizes)], lines)
 
 
+def peers_table(second: Rows, third: Rows) -> str:
+    """Format the flights of models that learned in other ways, with the networks and observations of the packaged one:
+    all scenarios together, with the least and most plans sent and time to arrival of a scenario.
+
+    :param second: rows of `studies.swarm.version2` in `flight-v2`. Flights among obstacles count from the braking
+        reserve on
+    :param third: those in `flight-v3`
+    """
+    second = [row for row in second if row["scenario"] in NAMES or row["set"] >= BRAKING]
+    third = [row for row in third if row["set"] in (THIRD, MOST, PEERS)]
+    learners = {
+        "`flight-v2`": (second, {"MADDPG": OWN_MODEL, "PPO": PPO_2, "imitation": IMITATION_2}),
+        "`flight-v3`": (third, {"MADDPG": THIRD_POLICIES["model"], "PPO": PPO_3, "imitation": IMITATION_3}),
+    }
+    lines = []
+    for preset, (rows, policies) in learners.items():
+        flown = [row for row in rows if row["plant"] == MODEL and not row.get("changes")]
+        for learner, policy in policies.items():
+            line = [preset, learner]
+            for n in SIZES.values():
+                here = [row for row in flown if row["n_robots"] == n]
+                own, full = ([row for row in here if row["policy"] == one] for one in (named(policy), FULL))
+                names = {row["scenario"] for row in own}
+                if not own:
+                    line.append("")
+                    continue
+                each = [
+                    [merged([row for row in part if row["scenario"] == name]) for part in (own, full)] for name in names
+                ]
+                shares = sorted(one["request_share"] for one, _ in each)
+                times = sorted(_lateness(*pair) for pair in each)
+                sent = f"{shares[0]:.2%} to {shares[-1]:.2%}"
+                took = f"{times[0]:+.0%} to {times[-1]:+.0%}".replace("-0%", "+0%")
+                line.append("<br>".join([seeds_rate([merged(own)]), sent, took]).replace(" ", "&nbsp;"))
+            lines.append(line)
+    return table(["preset", "learned by", *(f"{n} robots" for n in SIZES.values())], lines)
+
+
+def _lateness(own: dict[str, Any], full: dict[str, Any]) -> float:
+    return own["steps_to_arrival"] / full["steps_to_arrival"] - 1
+
+
 def late_table(rows: Rows) -> str:
     """Format flights in which others are observed late or lost from sight: collisions, plans sent, and arrival beside
     full communication.
@@ -751,7 +800,7 @@ def late_table(rows: Rows) -> str:
 
 def later(own: dict[str, Any], full: dict[str, Any]) -> str:
     """Format the time to arrival beside full communication, of flights that arrive."""
-    return f"{own['steps_to_arrival'] / full['steps_to_arrival'] - 1:+.0%}".replace("-0%", "+0%")
+    return f"{_lateness(own, full):+.0%}".replace("-0%", "+0%")
 
 
 def judged(own: dict[str, Any], full: dict[str, Any]) -> str:
@@ -927,6 +976,7 @@ def main() -> None:
         "anticipation": anticipation_table(sealed_3),
         "late": late_table([row for row in version_3 if "sensing" in row.get("changes", {})]),
         "timely": anticipation_table([row for row in version_3 if row["set"] == TIMELY], TIMELY_POLICIES, marked=False),
+        "peers": peers_table(sealed_2, version_3),
         "front": front_table(sealed_2, sealed_3, "docs/planner.md"),
         "front results": front_table(sealed_2, sealed_3, "planner.md"),
         "flight": flight_table(rows["flight"]),

@@ -349,6 +349,43 @@ def test_tables_of_version_3_say_who_sends_and_what_it_costs():
     assert first.strip("| ").split(" | ")[2] == "*nobody:* 5"
 
 
+def test_the_table_of_other_learners_counts_scenarios_together():
+    def row(policy: str, n_robots: int, scenario: str, collisions: int, share: float, steps: float, of: int) -> dict:
+        figures = {"policy": version2.named(policy), "n_robots": n_robots, "scenario": scenario, "plant": "model"}
+        figures |= {"collisions": collisions, "episodes": 1000, "request_share": share, "steps_to_arrival": steps}
+        return figures | {"arrived": 1000 - collisions, "set": of}
+
+    second = [
+        row("full", 8, "random", 0, 1.0, 60.0, 700),
+        row("full", 8, "forest", 0, 1.0, 100.0, version2.BRAKING),
+        row(version2.OWN_MODEL, 8, "random", 1, 0.01, 63.0, version2.TRAINED),
+        row(version2.OWN_MODEL, 8, "forest", 50, 0.03, 99.0, version2.TRAINED),
+        row(version2.OWN_MODEL, 8, "forest", 2, 0.02, 99.0, version2.BRAKING),
+        row(version2.PPO_2, 8, "random", 4, 0.015, 60.0, version2.PEERS),
+    ]
+    unbound = row(version2.IMITATION_3, 4, "random", 9, 0.5, 50.0, version2.TIMELY)
+    third = [
+        row("full", 4, "random", 0, 1.0, 50.0, version2.THIRD),
+        row(version2.THIRD_POLICIES["model"], 4, "random", 0, 0.001, 50.0, version2.THIRD),
+        row(version2.THIRD_POLICIES["model"], 4, "random", 1, 0.001, 50.0, version2.MOST),
+        unbound,
+    ]
+    head, _, *lines = report.peers_table(second, third).replace("&nbsp;", " ").splitlines()
+    table = {
+        tuple(cells[:2]): cells[2:] for cells in ([c.strip() for c in line.strip("|").split("|")] for line in lines)
+    }
+    assert [c.strip() for c in head.strip("|").split("|")][2:] == ["4 robots", "8 robots", "12 robots", "16 robots"]
+    assert table["`flight-v2`", "MADDPG"] == [
+        "",
+        "3 of 2,000<br>[0.05, 0.44] %<br>1.00% to 2.00%<br>-1% to +5%",
+        "",
+        "",
+    ]
+    assert table["`flight-v2`", "PPO"][1] == "4 of 1,000<br>[0.16, 1.02] %<br>1.50% to 1.50%<br>+0% to +0%"
+    assert table["`flight-v3`", "MADDPG"][0].startswith("1 of 2,000<br>")
+    assert table["`flight-v3`", "imitation"] == ["", "", "", ""]
+
+
 def test_the_table_of_late_perception_compares_within_each_world():
     def row(policy: str, collisions: int, share: float, steps: float, **sensing) -> dict:
         figures = {"scenario": "forest", "policy": version2.named(policy), "episodes": 1000, "collisions": collisions}
