@@ -392,8 +392,8 @@ def draw_telling(path: Path) -> None:
     """Draw what the packaged model of `flight-v3` sends: the plans of two flights, and how often it sends one by how
     wrong the other is and how close the two will pass."""
     config = make_config("flight-v3", n_robots=8)
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    panels = figure.subplots(1, 3, width_ratios=[1, 1, 1.2])
+    figure = Figure(figsize=(8, 7), layout="constrained")
+    panels = list(figure.subplot_mosaic([[0, 1], [2, 2]], height_ratios=[1.25, 1]).values())
     for axes, name in zip(panels, ("forest", "crossing_traffic"), strict=False):
         flight = fly(condition(THIRD_POLICIES["model"], name, config), LOOKED_AT)
         possible = (flight.arrival or len(flight.requests)) * 8 * 7
@@ -406,15 +406,15 @@ def draw_telling(path: Path) -> None:
         inside = (close >= low) & (close < high) & (wrong >= least) & (wrong < most)
         shares[row, column] = sent[inside].mean()
         colour = "white" if shares[row, column] > 0.03 else INK
-        axes.text(column, row, f"{shares[row, column]:.2%}", ha="center", va="center", color=colour, fontsize=8)
+        axes.text(column, row, f"{shares[row, column]:.2%}", ha="center", va="center", color=colour)
     axes.imshow(np.log10(np.maximum(shares, 1e-4)), cmap="Oranges", vmax=0, origin="lower", aspect="auto")
     for axis, bounds in ((axes.xaxis, WRONG), (axes.yaxis, CLOSE)):
         inner = [f"{low:g} to {high:g}" for low, high in pairwise(bounds[1:-1])]
         axis.set_ticks(range(len(bounds) - 1), [f"< {bounds[1]:g}", *inner, f"> {bounds[-2]:g}"])
     axes.set(
-        xlabel="error of what the other expects of it (m)",
-        ylabel="how close the robot's plan passes the other (m)",
-        title="share of plans sent, 280 flights",
+        xlabel="how far off the other is about the robot, within a second (m)",
+        ylabel="how close the robot's\nplan passes the other (m)",
+        title="share of possible plans that are sent, 280 flights",
     )
     axes.grid(visible=False)
     marks: dict[str, dict[str, Any]] = {
@@ -423,7 +423,7 @@ def draw_telling(path: Path) -> None:
         "a plan, from its sender to its receiver, in order": {"marker": r"$1\to$", "markersize": 16},
     }
     handles = [axes.plot([], [], linestyle="", color=RULES, label=name, **style)[0] for name, style in marks.items()]
-    figure.legend(handles=handles, loc="outside lower left", ncols=len(handles))
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     figure.savefig(path)
 
 
