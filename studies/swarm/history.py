@@ -122,6 +122,8 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=8000, help="updates (default %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parsed(parser)
+    if options.lessons < 2:
+        parser.error(f"argument --lessons: {options.lessons}: at least 2, one to learn from and one held out")
     model, kwargs = beginner(options)
     views = cast("PairActor", model.actor).views
     school = School(kwargs, options.target, options.seed)

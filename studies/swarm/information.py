@@ -34,6 +34,7 @@ from quad_swarm.task.request_task import RequestTask, make_task
 from quad_swarm.task.rules import RULES, Rule, parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.validation import read_assignments
+from quad_swarm.world.presets import PRESETS
 from quad_swarm.world.swarm import Swarm
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.main import main as command
@@ -215,7 +216,7 @@ def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
     :param parser: the command's other options
     """
-    parser.add_argument("--preset", default="flight-v3", help="the world (default %(default)s)")
+    parser.add_argument("--preset", default="flight-v3", choices=list(PRESETS), help="the world (default %(default)s)")
     parser.add_argument(
         "--world",
         nargs="*",

@@ -206,7 +206,8 @@ def validate(policies: Mapping[float, str], what: str, episodes: int, keys: Row)
 def main() -> None:
     """Run the command line."""
     parser = reference_arguments(__doc__)
-    parser.add_argument("--recipe", default="paper", help="NAME of quad_swarm_NAME.yml (default %(default)s)")
+    recipes = sorted(path.stem.removeprefix("quad_swarm_") for path in (ROOT / "zoo_configs").glob("quad_swarm_*.yml"))
+    parser.add_argument("--recipe", default="paper", choices=recipes, help="the recipe (default %(default)s)")
     parser.add_argument(
         "--price", type=float, nargs="+", default=[0.02, 0.1], help="price of a request (default %(default)s)"
     )
