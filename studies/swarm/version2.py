@@ -37,10 +37,11 @@ observe others 50, 100 or 200 ms late, or lose them from sight for a tenth of th
 late with a network that learned so. Set 731 is ``timely_SIZE`` and ``timely_model_SIZE``, all scenarios in `flight-v3`
 without commitment: nobody, everybody, a rule that tells much, and a model that knows which plans change others. Set 732
 is ``peers_SIZE`` and ``third_peers_SIZE``, all scenarios in `flight-v2` and `flight-v3`: PPO and imitation with the
-networks and observations of the packaged model. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at
-2fd9813, before robots of version 3 kept right of predicted others; set 721 never flew. All parts before set 706 fly
-with equal penalties, those before set 709 without the reserve, as they did. JSON: one row per policy, scenario and
-number of robots with the keys of `summarise`; written after each row, so that a run that is ended keeps what it has.
+networks and observations of the packaged model; set 733 ``timely_seeds_SIZE``, the model of set 731 with other training
+seeds. Set 720 (``third_model_eight`` and ``third_none_eight``) flew at 2fd9813, before robots of version 3 kept right
+of predicted others; set 721 never flew. All parts before set 706 fly with equal penalties, those before set 709 without
+the reserve, as they did. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written
+after each row, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ RESERVE, MASKED, CHEAP, STRANGE, BOLD, LACKING, THIRD, ELSEWHERE, OTHERS, CHANCE
     726,
     727,
 )
-LATE, LEARNED_LATE, TIMELY, PEERS = range(729, 733)
+LATE, LEARNED_LATE, TIMELY, PEERS, TIMELY_SEEDS = range(729, 734)
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -283,6 +284,19 @@ PARTS |= {
 PARTS |= {
     f"timely_model_{size}": Part(
         (TIMELY_POLICIES["model"],), EVERYWHERE, (n,), 1500, TIMELY, changes=UNBOUND, preset="flight-v3"
+    )
+    for size, n in SIZES.items()
+}
+# The same training with other seeds
+PARTS |= {
+    f"timely_seeds_{size}": Part(
+        tuple(f"studies/data/worth_seed{seed}.zip@0.3" for seed in (1, 2, 3, 4)),
+        EVERYWHERE,
+        (n,),
+        250,
+        TIMELY_SEEDS,
+        changes=UNBOUND,
+        preset="flight-v3",
     )
     for size, n in SIZES.items()
 }

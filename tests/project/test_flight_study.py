@@ -60,8 +60,9 @@ def test_sets_of_episodes_are_apart():
         version2.LEARNED_LATE,
         version2.TIMELY,
         version2.PEERS,
+        version2.TIMELY_SEEDS,
     )
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 33
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 34
 
 
 def test_the_table_at_a_glance_says_what_it_costs():
