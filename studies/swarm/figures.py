@@ -388,9 +388,12 @@ def _draw_sent(axes: Axes, flight: Flight) -> int:
 
 
 @rc_context(STYLE)
-def draw_telling(path: Path) -> None:
+def draw_telling(path: Path, episodes: int = 40) -> None:
     """Draw what the packaged model of `flight-v3` sends: the plans of two flights, and how often it sends one by how
-    wrong the other is and how close the two will pass."""
+    wrong the other is and how close the two will pass.
+
+    :param episodes: number of episodes of each scenario that are counted
+    """
     config = make_config("flight-v3", n_robots=8)
     figure = Figure(figsize=(8, 7), layout="constrained")
     panels = list(figure.subplot_mosaic([[0, 1], [2, 2]], height_ratios=[1.25, 1]).values())
@@ -398,13 +401,15 @@ def draw_telling(path: Path) -> None:
         flight = fly(condition(THIRD_POLICIES["model"], name, config), LOOKED_AT)
         possible = (flight.arrival or len(flight.requests)) * 8 * 7
         axes.set_title(f"{name.replace('_', ' ')}: {_draw_sent(axes, flight)} of {possible:,} plans")
-    wrong, close, sent = (np.concatenate(part) for part in zip(*(_sent(name, 40) for name in EVERYWHERE), strict=True))
+    wrong, close, sent = (
+        np.concatenate(part) for part in zip(*(_sent(name, episodes) for name in EVERYWHERE), strict=True)
+    )
     axes, shares = panels[2], np.zeros((len(CLOSE) - 1, len(WRONG) - 1))
     for (row, (low, high)), (column, (least, most)) in itertools.product(
         enumerate(pairwise(CLOSE)), enumerate(pairwise(WRONG))
     ):
         inside = (close >= low) & (close < high) & (wrong >= least) & (wrong < most)
-        shares[row, column] = sent[inside].mean()
+        shares[row, column] = sent[inside].mean() if inside.any() else 0.0
         colour = "white" if shares[row, column] > 0.03 else INK
         axes.text(column, row, f"{shares[row, column]:.2%}", ha="center", va="center", color=colour)
     axes.imshow(np.log10(np.maximum(shares, 1e-4)), cmap="Oranges", vmax=0, origin="lower", aspect="auto")
@@ -414,7 +419,7 @@ def draw_telling(path: Path) -> None:
     axes.set(
         xlabel="how far off the other is about the robot, within a second (m)",
         ylabel="how close the robot's\nplan passes the other (m)",
-        title="share of possible plans that are sent, 280 flights",
+        title=f"share of possible plans that are sent, {episodes * len(EVERYWHERE)} flights",
     )
     axes.grid(visible=False)
     marks: dict[str, dict[str, Any]] = {

@@ -3,7 +3,7 @@
 ``python -m studies.swarm.history [--frames K ...] [--lessons N] [--updates N] [--preset P] [--seed S] [--json F]``
 learns which plans change others' plans, as `studies.swarm.information` does, from what robots observe now (one frame)
 and from the last frames, each a step older, by the same network with more inputs. It prints how well held-out flights
-are told: a recurrent actor could know no more. JSON: one row per number of frames.
+are told, and so what a recurrent actor could gain from so much of the past. JSON: one row per number of frames.
 """
 
 from __future__ import annotations

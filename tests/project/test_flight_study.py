@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from PIL import Image
 
 from quad_swarm.evaluation.rows import read_rows, write_rows
 from quad_swarm.geometry import length
@@ -20,7 +21,7 @@ from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 from studies import wind
 from studies.swarm import anticipation as learned_anticipation
-from studies.swarm import commitment, delay_check, fly, half_spaces, report, tune_flight, version2
+from studies.swarm import commitment, delay_check, figures, fly, half_spaces, report, tune_flight, version2
 from studies.swarm.experiment import Experiment
 from studies.swarm.protocol import EARLIER, EARLIER_TEAMS, FLIGHT_TESTS, NAMES, TEST, VALIDATION, WORLDS
 
@@ -658,3 +659,16 @@ def test_who_sends_for_time_is_compared_with_full_communication_in_the_same_worl
     line = next(line for line in table.splitlines() if line.startswith("| forest"))
     cell = "*nobody:* 1; +3%<br>*rule:* 0; 5.12%; +0%<br>*model:* 0; 5.12%; +2%"
     assert line.replace("&nbsp;", " ") == f"| forest | {cell} | {cell} |"
+
+
+@pytest.mark.slow
+def test_the_figure_of_what_is_sent_counts_what_was_flown(tmp_path):
+    wrong, close, sent = figures._sent("forest", 2)
+    assert wrong.shape == close.shape == sent.shape
+    assert len(sent) % (8 * 7) == 0, "every robot, towards every other"
+    assert 0 < sent.mean() < 0.02
+    assert wrong[sent].mean() > 2 * wrong.mean(), "those who are wrong are told"
+    assert close[sent].mean() < 0.5 * close.mean(), "whom a plan passes closely"
+    figures.draw_telling(tmp_path / "telling.png", episodes=1)
+    with Image.open(tmp_path / "telling.png") as picture:
+        assert picture.size[0] >= 1000
