@@ -269,34 +269,13 @@ PARTS |= {
 # `studies.swarm.information`. Its threshold and the rule were chosen on sets 81 and 82
 UNBOUND: dict[str, Any] = {"planner": {"commitment": 0.0}}
 TIMELY_POLICIES = {"none": "none", "full": "full", "rule": "stage:1.2:0.2", "model": "studies/data/worth.zip@0.3"}
+# Last, the same training with other seeds
 PARTS |= {
-    f"timely_{size}": Part(
-        tuple(TIMELY_POLICIES[who] for who in ("none", "full", "rule")),
-        EVERYWHERE,
-        (n,),
-        500,
-        TIMELY,
-        changes=UNBOUND,
-        preset="flight-v3",
-    )
-    for size, n in SIZES.items()
-}
-PARTS |= {
-    f"timely_model_{size}": Part(
-        (TIMELY_POLICIES["model"],), EVERYWHERE, (n,), 1500, TIMELY, changes=UNBOUND, preset="flight-v3"
-    )
-    for size, n in SIZES.items()
-}
-# The same training with other seeds
-PARTS |= {
-    f"timely_seeds_{size}": Part(
-        tuple(f"studies/data/worth_seed{seed}.zip@0.3" for seed in (1, 2, 3, 4)),
-        EVERYWHERE,
-        (n,),
-        250,
-        TIMELY_SEEDS,
-        changes=UNBOUND,
-        preset="flight-v3",
+    f"{what}_{size}": Part(policies, EVERYWHERE, (n,), episodes, of, changes=UNBOUND, preset="flight-v3")
+    for what, policies, episodes, of in (
+        ("timely", tuple(TIMELY_POLICIES[who] for who in ("none", "full", "rule")), 500, TIMELY),
+        ("timely_model", (TIMELY_POLICIES["model"],), 1500, TIMELY),
+        ("timely_seeds", tuple(f"studies/data/worth_seed{seed}.zip@0.3" for seed in (1, 2, 3, 4)), 250, TIMELY_SEEDS),
     )
     for size, n in SIZES.items()
 }
